@@ -2,32 +2,31 @@
 The range of actions against learning speed and final return: a car on an oval.
 
     python benchmarks/action_scale.py [--seeds 5] [--steps 6000] [--figure]
-    python benchmarks/action_scale.py --steering        # and all of the speed's range
+    python benchmarks/action_scale.py --steering        # with the full range of speed
     python benchmarks/action_scale.py --wheelbase 0.4   # a car that turns more sharply
-    python benchmarks/action_scale.py --steering --wheelbase 0.25 --sde   # noise that persists
+    python benchmarks/action_scale.py --steering --wheelbase 0.25 --sde   # persistent noise
 
-Raffin reports it for the steering range of a racing car (*Learning to race in an hour*, 2022).
-Here, ``ActionScale`` shrinks the range of steering, and unless ``--steering`` is given that of the
-target speed, of a car that understeers, around straight ahead at 7 m/s. Each way of asking has a
-table of its own. Noise is drawn at every step, or with ``--sde`` for 16 steps at a time (gSDE, as
-the racing car had it). An episode ends after 20 s or off the track; its return is the distance
-covered [m]. The learner is CrossQ with the same settings for all; the policy's mean is evaluated
-for three episodes.
+Tests what Raffin reports for the steering range of a racing car (*Learning to race in an hour*,
+2022). ``ActionScale`` shrinks the range of steering of an understeering car, and that of its target
+speed unless ``--steering`` is given, around driving straight ahead at 7 m/s. Each combination of
+options has a table of its own. Noise is drawn at every step, or with ``--sde`` lasts for 16 steps
+(gSDE, as on the racing car). An episode ends after 20 s or off the track; its return is the
+distance covered [m]. The learner is CrossQ with the same settings for all; its mean policy is
+evaluated over three episodes.
 """
 
 import argparse
-import json
 import math
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from runs import CACHE, RESULTS, fresh_process, resume, save
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, save
 
 SCALES = (0.4, 0.7, 1.0, "schedule")
-#: from 0.4 of the range to the whole over two thirds of the steps
+#: from 0.4 of the range to the full range over two thirds of the steps
 SCHEDULE_SHARE = 2.0 / 3.0
-#: that are asked for [m]
+#: distances for which the number of steps is reported [m]
 DISTANCES = (100, 140, 160, 180, 200, 220)
 _EVERY = 500  # steps, from one evaluation to the next
 
@@ -106,25 +105,27 @@ def main() -> None:
     parser.add_argument("--wheelbase", type=float, default=_WHEELBASE, help="of the car [m]")
     parser.add_argument("--steering", action="store_true", help="shrink only its range")
     parser.add_argument("--sde", action="store_true", help="noise that lasts for 16 steps")
-    parser.add_argument("--worker", nargs=5, metavar=("SEED", "STEPS", "WHEELBASE", "AXES", "SDE"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        seed, steps, wheelbase, axes, sde = arguments.worker
-        given = int(seed), int(steps), float(wheelbase), json.loads(axes), json.loads(sde)
-        rows = [row for scale in SCALES for row in learn(str(scale), *given)]
-        print(json.dumps({"rows": rows}))
-        return
-    axes = [0] if arguments.steering else None
+    arguments = arguments_of(parser, worker)
     table = table_of(arguments.wheelbase, arguments.steering, arguments.sde)
     if not arguments.figure:
         wanted = [(seed, arguments.steps) for seed in range(arguments.seeds)]
-        given = arguments.wheelbase, json.dumps(axes), json.dumps(arguments.sde)
-        work = lambda *run: fresh_process(__file__, *run, *given, cache=CACHE)["rows"]  # noqa: E731
+        given = arguments.wheelbase, int(arguments.steering), int(arguments.sde)
+        work = lambda *run: fresh_process(__file__, *run, *given, cache=CACHE)  # noqa: E731
         resume(table, ["seed", "steps"], wanted, work, arguments.jobs)
     report(arguments.steps, table)
     for scale in SCALES[:-1]:
-        steps = steps_at_random(float(scale), arguments.wheelbase, axes)
+        steps = steps_at_random(float(scale), arguments.wheelbase, axes_of(arguments.steering))
         print(f"random actions, {scale} of the range: on the track for {steps:.1f} steps")
+
+
+def worker(seed: int, steps: int, wheelbase: float, steering: int, sde: int) -> list[dict]:
+    given = seed, steps, wheelbase, axes_of(bool(steering)), bool(sde)
+    return [row for scale in SCALES for row in learn(str(scale), *given)]
+
+
+def axes_of(steering: bool) -> list[int] | None:
+    """:return: actions whose range is scaled; None: all"""
+    return [0] if steering else None
 
 
 def steps_at_random(
@@ -145,7 +146,7 @@ def steps_at_random(
 
 
 def table_of(wheelbase: float, steering: bool, sde: bool) -> str:
-    """:return: its name"""
+    """:return: name of the table"""
     parts = ["action_scale"]
     parts += ["steering"] * steering
     parts += [f"wheelbase_{wheelbase:g}"] * (wheelbase != _WHEELBASE)

@@ -1,10 +1,10 @@
 """
-What a Ray cluster costs per run: tasks that do nothing, up to ten thousand in the queue.
+The overhead of a Ray cluster per run: tasks that do nothing, up to ten thousand in the queue.
 
     python benchmarks/cluster_overhead.py [--ray ADDRESS]
 
-Beside it, the same tasks in a pool of threads of this process. Without an address, a cluster of two
-nodes is started here.
+For comparison, the same tasks run in a pool of threads of this process. Without an address, the
+script starts a cluster of two nodes on this machine.
 """
 
 import argparse

@@ -1,19 +1,18 @@
 """
-HDS with default arguments on the other control tasks: return in the environment, and wall time.
+HDS with default arguments on six control tasks: return in the environment, and wall time.
 
     python benchmarks/control_tasks.py [--seeds 3]
 
-Each run is a fresh process with an empty compilation cache; the time counts from the start of its
-interpreter to the end of ``HDS(env_id).learn()``. The policy is then evaluated on 100 episodes of
-the environment as ``gymnasium.make`` makes it, the same resets for every seed.
+Each run is a fresh process with an empty compilation cache; its time counts from the start of the
+interpreter to the end of ``HDS(env_id).learn()``. The policy is then evaluated over 100 episodes of
+the environment as ``gymnasium.make`` makes it, with the same resets for every seed.
 """
 
 import argparse
-import json
 import sys
 
 import numpy as np
-from runs import fresh_process, save, seconds_since_start
+from runs import arguments_of, fresh_process, save, seconds_since_start
 
 # What counts as solved. CartPoleSwingUp: see `upright`.
 TASKS = {
@@ -31,12 +30,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--tasks", nargs="*", default=list(TASKS))
-    parser.add_argument("--worker", nargs=2, metavar=("ENV", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env_id, seed = arguments.worker
-        print(json.dumps(worker(env_id, int(seed))))
-        return
+    arguments = arguments_of(parser, worker)
     rows = []
     for env_id in arguments.tasks:
         for seed in range(arguments.seeds):

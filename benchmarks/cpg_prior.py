@@ -2,20 +2,20 @@
 SAC and gSDE-SAC with and without a rhythm under the policy: Swimmer-v5 and HalfCheetah-v5.
 
     python benchmarks/cpg_prior.py                 # 50,000 steps, three seeds
-    python benchmarks/cpg_prior.py --figure        # draw the figure again from the table
+    python benchmarks/cpg_prior.py --figure        # redraw the figure from the table
 
-The rhythm is a plain one, not the result of a search: joints one after another on a wave, at a
-frequency within the range of the search. ``residual`` and ``offset`` are the modes of ``CPGPrior``.
-Each run is a process of its own; what acts at the end is evaluated on 20 episodes, the same resets
-for every run. Runs that are in the table are not done again.
+The rhythm is not optimised: the joints follow a travelling wave, one after another, at a frequency
+within the range of the search. ``residual`` and ``offset`` are modes of ``CPGPrior``. Each run is a
+process of its own; its final policy is evaluated over 20 episodes, with the same resets for every
+run. Finished runs are kept.
 """
 
 import argparse
-import json
+from functools import partial
 
 import numpy as np
 import pandas as pd
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 TAU = 2.0 * np.pi
 #: a travelling wave for each environment: arguments of ``CPGPrior``
@@ -35,7 +35,7 @@ RHYTHMS = {
         "kd": 0.05,
     },
 }
-#: how far an action of 1 goes: commands, rad
+#: effect of an action of 1: on commands, on targets [rad]
 RANGES = {"residual": 0.5, "offset": 0.5}
 PRIORS = ("none", "residual", "offset", "parameters")
 LEARNERS = ("sac", "gsde_sac")
@@ -51,12 +51,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50_000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=5, metavar=("ENV", "LEARNER", "PRIOR", "SEED", "STEPS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env_id, learner, prior, seed, steps = arguments.worker
-        print(json.dumps(worker(env_id, learner, prior, int(seed), int(steps))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (env_id, learner, prior, seed, arguments.steps)
@@ -65,17 +60,14 @@ def main() -> None:
             for learner in arguments.learners
             for prior in arguments.priors
         ]
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
         keys = ("env", "learner", "prior", "seed", "steps")
-        resume("cpg_prior", keys, wanted, _run, arguments.jobs)
+        resume("cpg_prior", keys, wanted, work, arguments.jobs)
     report()
 
 
-def _run(*run) -> list[dict]:
-    return [fresh_process(__file__, *run, cache=CACHE / "programs")]
-
-
 def worker(env_id: str, learner: str, prior: str, seed: int, steps: int) -> dict:
-    """Learn once, then evaluate what was learned."""
+    """Learn once, then evaluate the policy."""
     from sb3_hds.experiments import returns_of
 
     model = algorithm(learner)("MlpPolicy", make(env_id, prior), seed=seed, **settings(learner))

@@ -1,23 +1,21 @@
 """
-The cost of a diagnosis against the number of recordings.
+The time and memory of a diagnosis against the number of recordings.
 
     python benchmarks/diagnosis_cost.py
     python benchmarks/diagnosis_cost.py --systems pendulum --recordings 10 30 --budgets quick
     python benchmarks/diagnosis_cost.py --report-only
 
-A pendulum and a double pendulum on MuJoCo's engine with dry friction that `diagnose` is not told
-of, against the whole catalogue; recordings of 200 steps. Each row is a fresh process: first with
-nothing compiled beforehand, then with the programs that the first one kept. Starting Python and
-making the data do not count. Processor seconds are those of all cores, and hardly depend on what
-else the machine does. Memory is the peak resident size of the process. A straight line is fitted to
-the seconds, relative errors of all rows counting the same: its ends, how far rows are from it, and
-the exponent between the two largest numbers of recordings, which is 1 where the cost is linear.
-Finished rows are kept.
+The data are recordings of 200 steps of a pendulum and a double pendulum on MuJoCo's engine with dry
+friction, diagnosed with the full catalogue. Each row is a fresh process: first with an empty
+compilation cache, then with the cache of the first one. Starting Python and making the data do not
+count. Processor seconds are the sum over all cores and hardly depend on other load. Memory is the
+peak resident size of the process. A straight line is fitted to the seconds by relative errors; the
+table of lines has its coefficients, its largest deviation, and the exponent between the two largest
+numbers of recordings, which is 1 where the cost is linear. Finished rows are kept.
 """
 
 import argparse
 import dataclasses
-import json
 import resource
 import shutil
 import time
@@ -25,20 +23,20 @@ from collections.abc import Iterable
 
 import numpy as np
 import pandas as pd
-from hidden_cases import believed, nothing, recorded
+from hidden_cases import nominal_twin, nothing, recorded
 from independent_rigs import Planted
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 RECORDINGS = (10, 30, 100, 300, 1000)
 BUDGETS = ("quick", "full")
-#: and how strong the dry friction at the first joint is [N m]
+#: systems, and the dry friction at their first joint [N m]
 SYSTEMS = {"pendulum": 0.05, "double_pendulum": 0.05}
 NOISE = "1 %"
-#: seconds that ten recordings may take, compilation included
-PROMISED = {"quick": 15.0, "full": 60.0}
+#: target for the seconds of ten recordings, compilation included
+TARGETS = {"quick": 15.0, "full": 60.0}
 # Two numbers always lie on a line.
 _FEWEST = 3
-_LINES = ("system", "budget", "programs")
+_LINES = ("system", "budget", "cache")
 
 
 def main() -> None:
@@ -47,12 +45,7 @@ def main() -> None:
     parser.add_argument("--recordings", nargs="*", type=int, default=list(RECORDINGS))
     parser.add_argument("--budgets", nargs="*", default=list(BUDGETS), choices=BUDGETS)
     parser.add_argument("--report-only", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("SYSTEM", "BUDGET", "RECORDINGS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        system, budget, n = arguments.worker
-        print(json.dumps(worker(system, budget, int(n))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.report_only:
         wanted = [
             (system, budget, n)
@@ -70,13 +63,13 @@ def main() -> None:
 
 
 def cold_and_warm(system: str, budget: str, n: int) -> list[dict]:
-    """The same diagnosis by two processes, of which the second finds what the first compiled."""
+    """Run the same diagnosis in two processes; the second has the cache of the first."""
     folder = CACHE / "cost"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return [
-        {"programs": programs} | fresh_process(__file__, system, budget, n, cache=folder)
-        for programs in ("compiled", "kept")
+        {"cache": cache} | fresh_process(__file__, system, budget, n, cache=folder)
+        for cache in ("empty", "warm")
     ]
 
 
@@ -84,7 +77,7 @@ def worker(system: str, budget: str, n: int) -> dict:
     planted = Planted("coulomb_friction", 0, {"tau_c": SYSTEMS[system]})
     case = dataclasses.replace(nothing(system, NOISE, recordings=n), planted=(planted,))
     data, _ = recorded(case, seed=n)
-    twin = believed(system)
+    twin = nominal_twin(system)
     simulated, busy = seconds_since_start(), time.process_time()
     from sb3_hds import diagnose
 
@@ -99,15 +92,15 @@ def worker(system: str, budget: str, n: int) -> dict:
 
 
 def straight_lines(table: pd.DataFrame) -> pd.DataFrame:
-    """:return: of each system, budget and state of the programs, what the cost is made of"""
+    """Fit a straight line for each system, budget and state of the compilation cache."""
     rows = []
     for label, own in table.groupby(list(_LINES), sort=False):
         own = own.sort_values("recordings")
         row = dict(zip(_LINES, label, strict=True)) | fitted(own["recordings"], own["seconds"])
         ten = own.loc[own["recordings"] == 10, "seconds"]
-        if row["programs"] == "compiled" and len(ten):
-            row["promise"] = PROMISED[row["budget"]]
-            row["kept"] = "yes" if ten.iloc[0] <= row["promise"] else "no"
+        if row["cache"] == "empty" and len(ten):
+            row["target_seconds"] = TARGETS[row["budget"]]
+            row["reached"] = "yes" if ten.iloc[0] <= row["target_seconds"] else "no"
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -139,10 +132,10 @@ def figure(table: pd.DataFrame) -> None:
     panels = drawing.subplots(1, len(systems), squeeze=False, sharey=True)[0]
     for panel, system in zip(panels, systems, strict=True):
         for budget, colour in zip(BUDGETS, ("#7fa6cc", "#27496d"), strict=True):
-            for programs, line in (("compiled", "o-"), ("kept", "o:")):
+            for cache, line in (("empty", "o-"), ("warm", "o:")):
                 own = (table["system"] == system) & (table["budget"] == budget)
-                rows = table[own & (table["programs"] == programs)].sort_values("recordings")
-                label = f"{budget}, programs {programs}"
+                rows = table[own & (table["cache"] == cache)].sort_values("recordings")
+                label = f"{budget}, {cache} cache"
                 panel.loglog(rows["recordings"], rows["seconds"], line, color=colour, label=label)
         panel.set_title(system.replace("_", " "))
         panel.set_xlabel("recordings of 200 steps")

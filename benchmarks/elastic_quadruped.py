@@ -2,35 +2,35 @@
 A quadruped with series elasticity: RL alone, an optimised rhythm, and combinations of both.
 
     python benchmarks/elastic_quadruped.py              # 50,000 steps, three seeds
-    python benchmarks/elastic_quadruped.py --figure     # draw the figure again from the table
+    python benchmarks/elastic_quadruped.py --figure     # redraw the figure from the table
 
-`sb3_hds/ElasticQuadruped-v0`, the same number of real steps for all:
+The environment is `sb3_hds/ElasticQuadruped-v0`; all methods have the same number of real steps:
 
-- ``rl, position`` and ``rl, force``: gSDE-SAC alone, an action being the angles of the motors, or
-  the torques that springs shall pass on
-- ``plain rhythm``: a trot that nobody optimised, and no learning
+- ``rl, position`` and ``rl, force``: gSDE-SAC alone; an action sets the angles of the motors, or
+  the torques that the springs transmit
+- ``plain rhythm``: a trot that was not optimised, without learning
 - ``plain rhythm, torque``: the same targets, tracked by torques at the 50 Hz of the policy
-- ``rhythm``: the trot that ``OpenLoop`` finds from there, all legs doing the same
-- ``rhythm, free legs``: every joint for itself, 25 numbers instead of seven
+- ``rhythm``: the trot that ``OpenLoop`` finds from there, all legs moving alike
+- ``rhythm, free legs``: the same search over every joint, 25 parameters instead of seven
 - ``rhythm, then rl``: half the steps for the search, the rest for gSDE-SAC, which adds offsets to
-  the targets of the gait that was found
+  the targets of the optimised gait
 - ``rl over a plain rhythm``: the same offsets, over the plain trot
-- ``rl sets the rhythm``: gSDE-SAC sets amplitudes and frequency of the plain trot while it walks
+- ``rl sets the rhythm``: gSDE-SAC sets amplitudes and frequency of the plain trot at every step
 
-Other rhythms command the angles of the motors, which the drives hold at 500 Hz: a rotor on
-15 N m/rad swings faster than a loop at 50 Hz can hold.
+All other rhythms command the angles of the motors, which the drives control at 500 Hz: a rotor on
+15 N m/rad oscillates too fast for a loop at 50 Hz.
 
-Each run is a process of its own; what acts at the end is evaluated on 20 episodes, the same resets
-for every run. Runs that are in the table are not done again.
+Each run is a process of its own; its final policy is evaluated over 20 episodes, with the same
+resets for every run. Finished runs are kept.
 """
 
 import argparse
-import json
 import math
+from functools import partial
 
 import numpy as np
 import pandas as pd
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 METHODS = (
     "rl, position",
@@ -68,28 +68,20 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50_000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("METHOD", "SEED", "STEPS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        method, seed, steps = arguments.worker
-        print(json.dumps(worker(method, int(seed), int(steps))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (method, seed, arguments.steps)
             for seed in range(arguments.seeds)
             for method in arguments.methods
         ]
-        resume("elastic_quadruped", ("method", "seed", "steps"), wanted, _run, arguments.jobs)
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
+        resume("elastic_quadruped", ("method", "seed", "steps"), wanted, work, arguments.jobs)
     report()
 
 
-def _run(*run) -> list[dict]:
-    return [fresh_process(__file__, *run, cache=CACHE / "programs")]
-
-
 def worker(method: str, seed: int, steps: int) -> dict:
-    """Learn once, then evaluate what was learned."""
+    """Learn once, then evaluate the policy."""
     from sb3_hds.experiments import returns_of
 
     model, env = learned(method, seed, steps)
@@ -136,7 +128,7 @@ def over(gait: dict, mode: str, **settings):
 
 
 def plain(seed: int, gait: str | None = "trot"):
-    """:return: the plain trot, from which a search can go on"""
+    """:return: the plain trot, from which a search can start"""
     from sb3_hds import OpenLoop
 
     model = OpenLoop("MlpPolicy", make("position"), seed=seed, gait=gait, **SEARCH)

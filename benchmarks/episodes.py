@@ -1,4 +1,4 @@
-"""Whole episodes of a policy, several side by side."""
+"""Returns of a policy over whole episodes in several environments in parallel."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,20 +1,19 @@
 """
-The cost of a planning epoch against the number of rollouts, and a profile of a cold start.
+The cost of a planning epoch against the number of rollouts, and the parts of a cold start.
 
     python benchmarks/epoch_cost.py
 
-Pendulum-v1, default arguments but for ``n_rollouts``; one fresh process per row. Memory is the peak
-resident size of the process. The regression does not grow with the number of rollouts (96 steps of
-512 samples), the planning does: both are timed.
+Pendulum-v1 with default arguments except ``n_rollouts``; one fresh process per row. Memory is the
+peak resident size of the process. Planning grows with the number of rollouts, the regression does
+not (96 steps of 512 samples): both are timed.
 """
 
 import argparse
-import json
 import resource
 import sys
 import time
 
-from runs import RESULTS, fresh_process, save, seconds_since_start
+from runs import RESULTS, arguments_of, fresh_process, save, seconds_since_start
 
 ROLLOUTS = (64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384)
 N_EPOCHS = 5
@@ -22,11 +21,7 @@ N_EPOCHS = 5
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument("--worker", nargs=1, metavar="N_ROLLOUTS")
-    arguments = parser.parse_args()
-    if arguments.worker:
-        print(json.dumps(worker(int(arguments.worker[0]))))
-        return
+    arguments_of(parser, worker)
     rows = []
     for n_rollouts in ROLLOUTS:
         print(f"{n_rollouts} rollouts ...", file=sys.stderr, flush=True)

@@ -1,30 +1,30 @@
 """
-The price of smooth exploration: return against continuity, for white noise and gSDE.
+The price of smooth exploration: return against continuity cost, for white noise and gSDE.
 
     python benchmarks/gsde_continuity.py                 # two environments, three seeds
-    python benchmarks/gsde_continuity.py --figure        # draw the figure again from the table
+    python benchmarks/gsde_continuity.py --figure        # redraw the figure from the table
 
 After figure 2 of Raffin, Kober and Stulp, *Smooth Exploration for Robotic Reinforcement Learning*,
-CoRL 2021. The learner is GSDESAC throughout, updated after each episode as often as it has steps,
-so that only the noise differs: drawn anew at every step without regard to the state, or from
-features of the state by a matrix that stays for 2, 8, 64 steps or a whole episode. The continuity
-cost is theirs, 100 times the mean square of the change between successive actions as a share of
-their range: 0 for a constant action, 100 for one that jumps from end to end. It is taken while
-learning (from the first update on, what motors feel), and of the mean policy that is evaluated.
+CoRL 2021. The learner is always GSDESAC, with as many updates after each episode as it had steps,
+so that only the noise differs: drawn at every step independently of the state, or computed from
+features of the state by a matrix that lasts for 2, 8, 64 steps or a whole episode. The continuity
+cost is that of the paper, 100 times the mean square of the change between successive actions as a
+share of their range: 0 for a constant action, 100 for one that jumps from end to end. It is
+measured during learning, from the first update on, and for the mean policy that is evaluated.
 Finished runs are kept.
 """
 
 import argparse
-import json
+from functools import partial
 
 import gymnasium
 import numpy as np
 import pandas as pd
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 #: steps of a run, by environment; all their episodes have the same length
 LENGTHS = {"Pendulum-v1": 10_000, "HalfCheetah-v5": 50_000}
-#: of gSDE's noise: how many steps it stays; None: unstructured noise
+#: number of steps between new noise matrices of gSDE; None: unstructured noise
 NOISES = {"unstructured": None, "gSDE 2": 2, "gSDE 8": 8, "gSDE 64": 64, "gSDE episode": -1}
 SETTINGS = {
     "Pendulum-v1": {"learning_starts": 500, "learning_rate": 1e-3},
@@ -63,12 +63,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("ENV", "NOISE", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env_id, noise, seed = arguments.worker
-        print(json.dumps({"rows": [worker(env_id, noise, int(seed))]}))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (env_id, noise, seed)
@@ -76,7 +71,7 @@ def main() -> None:
             for seed in range(arguments.seeds)
             for noise in NOISES
         ]
-        in_process = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+        in_process = partial(fresh_process, __file__, cache=CACHE)
         resume("gsde_continuity", KEYS, wanted, in_process, arguments.jobs)
     report()
 

@@ -30,7 +30,7 @@ CELLS = {
     ),
     "euler steps": (PENDULUM, {}),
 }
-#: cells whose data sheet is right, and whose twin integrates otherwise than the system moves
+#: cells whose data sheet is right, and whose twin has another integrator than the system
 OTHER_TWIN = {"euler steps": "Pendulum"}
 #: steps of an episode
 LENGTH = {PENDULUM: 200, CART: 250}
@@ -38,7 +38,7 @@ N_STARTS = 50
 
 
 def make(cell: str):
-    """:return: the system as it is"""
+    """:return: the real system"""
     import gymnasium
 
     import sb3_hds  # noqa: F401
@@ -52,7 +52,7 @@ def length_of(cell: str) -> int:
 
 
 def data_sheet(cell: str):
-    """:return: the twin as its maker describes the system: nothing of what is hidden"""
+    """:return: the twin according to the data sheet, without the hidden deviations"""
     from sb3_hds import twins
 
     env_id = CELLS[cell][0]
@@ -78,7 +78,7 @@ def pretrained(cell: str, seed: int, **changes):
 
 
 def kept_at(twin: str, seed: int, changes: dict) -> Path:
-    """:return: file of a model; other code, other file"""
+    """:return: file of a model, by the version of the code"""
     import sb3_hds
 
     label = "_".join(f"{name}={value}" for name, value in sorted(changes.items()))
@@ -87,5 +87,5 @@ def kept_at(twin: str, seed: int, changes: dict) -> Path:
 
 
 def return_of(model, cell: str) -> float:
-    """:return: mean over the same start states of the real system, whoever asks"""
+    """:return: mean return over fixed start states of the real system"""
     return float(returns_of(model, [make(cell) for _ in range(N_STARTS)], 50_000).mean())

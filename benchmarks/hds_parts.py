@@ -3,34 +3,34 @@ Ablations of HDS: one part changed at a time, on a stand-in for worn hardware.
 
     python benchmarks/hds_parts.py                        # beta, parts and weaknesses, five seeds
     python benchmarks/hds_parts.py --tables parts --seeds 2 --jobs 1
-    python benchmarks/hds_parts.py --figure                # draw the figures again from the tables
+    python benchmarks/hds_parts.py --figure               # redraw the figures from the tables
 
-The cell "worn" of `hardware.py` is heavier and longer than its data sheet says, has dry friction,
-and stirs the air, for which the twin has no parameter and HDS suspects no effect. Runs with the
-same seed start from the same policy where the change does not touch the pretraining. Returns are
-means over the same 50 start states; finished runs are kept.
+The cell "worn" of `hardware.py` is heavier and longer than its data sheet says and has dry friction
+and air drag; the twin has no parameter for drag, and HDS suspects no such effect. Runs with the
+same seed start from the same policy unless the change affects the pretraining. Returns are means
+over the same 50 start states. Finished runs are kept.
 
-beta: the share of plans made in the model with the learned force, which is all that is learned
-here, as in the HDS project: no parameter is estimated and no effect suspected. Beside the return,
-what the HDS project asked about numerical stability: samples that were dropped because they were
-not finite, the norm of the policy's gradient, and that of the derivative of the return of 100 steps
-by the first action, at the median and at its worst over 256 start states, in the model that was
-learned.
+beta: the share of plans made in the model with the learned force. As in the HDS project, only that
+force is learned: no parameter is estimated and no effect suspected. Besides the return, the table
+has measures of the numerical stability that the HDS project asked about: the number of non-finite
+samples that were dropped, the norm of the policy's gradient, and the median and the maximum, over
+256 start states, of the derivative of the return of 100 steps by the first action, in the learned
+model.
 
-parts: each remedy and each way to use the data switched off. "wrong twin" and "ceiling", what was
-planned in the data sheet's twin and in the true one, are the ends of the gap; the share of it that
-is closed is printed beside the returns, for beta too.
+parts: each remedy and each use of the data switched off. "wrong twin" and "ceiling", planned in the
+data sheet's twin and in the true one, are the ends of the gap; the share of it that a variant
+closes is printed beside its return, also for beta.
 
 weaknesses: the four that the authors of HDS name, with the remedy off and on, without data.
 """
 
 import argparse
-import json
+from functools import partial
 
 import numpy as np
 import pandas as pd
 from hardware import N_STARTS, data_sheet, length_of, make, pretrained, return_of
-from runs import CACHE, RESULTS, fresh_process, resume
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume
 from sim_to_real import planner
 
 CELL, EPISODES = "worn", 5
@@ -38,9 +38,9 @@ BETAS = (0.0, 0.05, 0.1, 0.3, 1.0, "auto")
 # Ends of the gap, as `sim_to_real.py` calls them.
 ENDS = {"wrong twin": "wrong_twin", "ceiling": "ceiling"}
 PARTS = {
-    "as it is": {},
-    "noise does not decay": {"exploration_decay": 1.0},
-    "best step always": {"temperature": 0.0},
+    "HDS, default settings": {},
+    "constant exploration noise": {"exploration_decay": 1.0},
+    "no annealed acceptance": {"temperature": 0.0},
     "no terminal value": {"terminal_value": False},
     "no calibration": {"calibrated": None},
     "nothing suspected": {"suspected": ()},
@@ -58,22 +58,21 @@ def main() -> None:
     parser.add_argument("--tables", nargs="*", default=list(TABLES), choices=TABLES)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("TABLE", "VARIANT", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        table, variant, seed = arguments.worker
-        print(json.dumps({"rows": [WORK[table](variant, int(seed))]}))
-        return
+    arguments = arguments_of(parser, worker)
     for table in arguments.tables:
         if not arguments.figure:
             wanted = [(v, seed) for seed in range(arguments.seeds) for v in VARIANTS[table]]
-            work = lambda v, seed, t=table: fresh_process(__file__, t, v, seed, cache=CACHE)["rows"]  # noqa: E731
+            work = partial(fresh_process, __file__, table, cache=CACHE)
             resume(f"hds_{table}", ("variant", "seed"), wanted, work, arguments.jobs)
         report(table)
 
 
+def worker(table: str, variant: str, seed: int) -> dict:
+    return WORK[table](variant, seed)
+
+
 def learned(changes: dict, seed: int) -> tuple:
-    """:return: HDS after some real episodes, with what happened in each of its epochs"""
+    """:return: HDS after some real episodes, with the log of each of its epochs"""
     first = {name: value for name, value in changes.items() if name in PRETRAINED_WITH}
     model, reports = pretrained(CELL, seed, **first), []
     for name, value in changes.items():
@@ -99,7 +98,7 @@ def beta(variant: str, seed: int) -> dict:
 
 
 def derivative_norms(model, n_steps: int = 100, n_starts: int = 256) -> np.ndarray:
-    """Of the return of random torques by the first of them, in the model that is planned in."""
+    """Norms of the derivative of the return of random torques by the first one, in the model."""
     import jax
     import jax.numpy as jnp
 
@@ -128,7 +127,7 @@ def parts(variant: str, seed: int) -> dict:
 
 
 def in_twin(cell: str, **changes):
-    """Return on the real system of what was planned in the data sheet's twin."""
+    """Return on the real system of a policy planned in the data sheet's twin."""
 
     def work(seed: int) -> float:
         return return_of(pretrained(cell, seed, **changes), cell)
@@ -156,7 +155,7 @@ def balanced(**changes):
 
 
 def open_loop(closed: bool):
-    """The policy's own commands, either seen through in the twin beforehand, or as it goes."""
+    """The policy's commands, either computed in the twin beforehand (open loop) or in feedback."""
 
     def work(seed: int) -> float:
         model, env = pretrained("heavy, long", seed), make("heavy, long")
@@ -225,7 +224,7 @@ def report(table: str) -> None:
 
 
 def in_order(table: str) -> pd.DataFrame:
-    """:return: rows of the table, whenever they were measured, as variants are listed here"""
+    """:return: rows of the table in the order of the variants here"""
     rows = pd.read_csv(RESULTS / f"hds_{table}.csv", dtype={"variant": str})
     place = {variant: i for i, variant in enumerate(VARIANTS[table])}
     rows = rows[rows["variant"].isin(place)]

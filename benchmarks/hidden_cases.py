@@ -1,8 +1,9 @@
 """
 The cases of `hidden_effects.py`: planted effects, their places and sizes, and the recordings.
 
-Everything about a case follows from its system and its number. Kinds of cases, effects, sizes,
-noises and numbers of recordings are dealt like cards: each comes up in its share, not by chance.
+A case is determined by its system and its number. Kinds of cases, effects, sizes, noises and
+numbers of recordings are drawn without replacement from shuffled decks, so that each occurs in its
+exact share.
 """
 
 import dataclasses
@@ -39,7 +40,7 @@ N_STEPS = 200
 #: rounds every channel to its tick, the square root of 12 times that: two hundred ticks or so to a
 #: turn. A rig's own electronics computes the velocities, so their ticks are no finer or coarser.
 NOISES = {"tick": 2e-3, "1 %": 0.01, "5 %": 0.05}
-#: kinds of cases, and how many of a hundred; one cause and several take turns
+#: kinds of cases and their number in a hundred; single and several causes alternate
 SHARES = {
     "effect": 20,
     "several": 20,
@@ -51,13 +52,13 @@ SHARES = {
     "still": 3,
 }
 NULLS = tuple(kind for kind in SHARES if kind.startswith("null"))
-#: Pendulum-v1's twin, which steps by Euler's rule, against the engine
+#: Pendulum-v1's twin, which takes semi-implicit Euler steps, compared with the engine
 EULERS = "Euler's twin"
 RIGS: dict[str, System] = {**SYSTEMS, "pendulum_v1": EULER, **FROM_FILES}
-#: of four cases of a kind, the one that other rules are asked about
+#: other rules are applied to one in so many cases of a kind
 ASKED = 4
 PARAMETER = "parameter"
-# Effects that are planted at joints.
+# Effects that can be planted at joints.
 JOINT = (
     "viscous_friction",
     "directional_viscous_friction",
@@ -72,20 +73,20 @@ JOINT = (
     "cogging",
     "constant_force",
 )
-# Pairs that are hard to tell from one cause, planted at one place; the other half are any two.
+# Pairs that resemble a single cause, planted at one place; half of the pairs are arbitrary.
 _CONFOUNDED = (
     ("action_delay", "motor_lag"),
     ("coulomb_friction", "constant_force"),
     ("torque_gain", PARAMETER),
 )
-# Whether the base is 10 % wrong, and which disturbance there is, of single effects.
+# For single effects: whether the base parameter is 10 % wrong, and the disturbance.
 _CONDITIONS = (
     *((False, 0.0),) * 10,
     *((True, 0.0),) * 4,
     *((False, 0.02), (False, 0.05)) * 2,
     *((True, 0.02), (True, 0.05)),
 )
-# How often a case that cannot be is drawn again, and for how long with the same effect.
+# How often an impossible case is redrawn, and how many of these times with the same effect.
 _TRIES, _SAME = 200, 20
 
 # Of twins from model files, within an interval of 20 ms.
@@ -100,14 +101,14 @@ class Case:
     :param system: key of ``RIGS``
     :param number: of the case
     :param kind: key of ``SHARES``
-    :param planted: what is there and the twin does not know
-    :param factor: by how much it is larger than the smallest that would show; 0 for nothing
+    :param planted: effects that the twin under diagnosis lacks
+    :param factor: their size in detection limits; 0 without any
     :param noise: key of ``NOISES``
-    :param recordings: their number
-    :param wrong_base: whether a parameter is wrong that nobody believes
-    :param base_change: by how much it is off, or its planted deviation
+    :param recordings: number of recordings
+    :param wrong_base: whether a nuisance parameter (`System.base`) is wrong
+    :param base_change: its deviation, planted or not
     :param disturbance: coloured torque, in units of the typical command
-    :param asked: whether other rules are asked, too
+    :param asked: whether other rules are applied as well
     :param loop: ``"open"`` where commands are torques as they come; a ``"position"`` or
         ``"velocity"`` loop makes them of what is measured
     :param seen: what is recorded: ``"qv"`` for positions and velocities, ``"q"`` for positions
@@ -131,7 +132,7 @@ class Case:
 
     @property
     def truths(self) -> tuple[str, ...]:
-        """Names and places, as a diagnosis gives them; none for what it cannot name."""
+        """Names and places as a diagnosis reports them; empty for effects outside the catalogue."""
         if self.kind == "outside":
             return ()
         return tuple(name_of(planted, self.system) for planted in self.planted)
@@ -143,19 +144,19 @@ class Case:
 
 
 def kinds(system: str) -> tuple[str, ...]:
-    """:return: of a hundred cases in a row; any number of first ones has nearly the right shares"""
+    """:return: kinds of a hundred cases in order; the first n have nearly the right shares"""
     if RIGS[system] is EULER:
         return (EULERS,) * 100
-    shares, dealt = dict(SHARES), list[str]()
+    shares, order = dict(SHARES), list[str]()
     shares["effect"] += shares.pop("several")
     if RIGS[system].base is None:
         shares["null"] += shares.pop("null, wrong base")
     for n in range(1, 101):
-        behind = {kind: share * n / 100 - dealt.count(kind) for kind, share in shares.items()}
-        dealt.append(max(behind, key=lambda kind: behind[kind]))
-    for place in [i for i, kind in enumerate(dealt) if kind == "effect"][1::2]:
-        dealt[place] = "several"
-    return tuple(dealt)
+        behind = {kind: share * n / 100 - order.count(kind) for kind, share in shares.items()}
+        order.append(max(behind, key=lambda kind: behind[kind]))
+    for place in [i for i, kind in enumerate(order) if kind == "effect"][1::2]:
+        order[place] = "several"
+    return tuple(order)
 
 
 def kind_of(system: str, number: int) -> tuple[str, int]:
@@ -164,9 +165,9 @@ def kind_of(system: str, number: int) -> tuple[str, int]:
         many, as they have every second card of their packs
     """
     hundreds, place = divmod(number, 100)
-    dealt = kinds(system)
-    kind = dealt[place]
-    turn = hundreds * dealt.count(kind) + dealt[:place].count(kind)
+    order = kinds(system)
+    kind = order[place]
+    turn = hundreds * order.count(kind) + order[:place].count(kind)
     return kind, 2 * turn if kind == "effect" else turn
 
 
@@ -182,7 +183,7 @@ def draw(
     turn = number
     if not kind:
         kind, turn = kind_of(system, number)
-    deal = functools.partial(dealt, turn, system, kind)
+    deal = functools.partial(from_deck, turn, system, kind)
     factors = {"effect": (2.0, 4.0, 8.0), "pair": (2.0, 4.0, 8.0), "outside": (4.0, 8.0)}
     noise = noise or deal("noise", ("tick", "tick", "1 %", "1 %", "5 %"))
     wrong, disturbance = deal("condition", _CONDITIONS) if kind == "effect" else (False, 0.0)
@@ -213,15 +214,15 @@ def draw(
     raise RuntimeError(f"{system}, case {number}: nothing could be planted in {_TRIES} tries.")
 
 
-def dealt(turn: int, system: str, kind: str, what: str, cards: Sequence[_Card]) -> _Card:
-    """A card of a pack that is shuffled anew when it has been dealt."""
+def from_deck(turn: int, system: str, kind: str, what: str, cards: Sequence[_Card]) -> _Card:
+    """Draw without replacement from a deck that is reshuffled when it is used up."""
     pack, place = divmod(turn, len(cards))
     label = zlib.crc32(f"{system}, {kind}, {what}".encode())
     return cards[int(np.random.default_rng([label, pack]).permutation(len(cards))[place])]
 
 
 def _planted(case: Case, deal: Any, rng: np.random.Generator, again: int) -> Case | None:
-    """:return: the case with something planted, as its kind says; None if that cannot be"""
+    """:return: the case with planted effects according to its kind; None if that is impossible"""
     system, rig = case.system, RIGS[case.system]
     chosen, index = (), None
     if case.kind == "effect":
@@ -253,7 +254,7 @@ def _planted(case: Case, deal: Any, rng: np.random.Generator, again: int) -> Cas
 
 
 def plantable(rig: System) -> tuple[str, ...]:
-    """:return: what can be planted in this rig"""
+    """:return: effects that can be planted in this rig"""
     apart = tuple(TRANSMISSIONS) if rig.apart else ()
     own = (PARAMETER,) if rig.base else ()
     return (*JOINT, *COMMANDS, *SENSORS, *apart, *own)
@@ -265,13 +266,13 @@ def slot_of(effect: str) -> str:
 
 
 def places_of(effect: str, system: str) -> Sequence[Any]:
-    twin = believed(system)
+    twin = nominal_twin(system)
     slots = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
     return slots[slot_of(effect)]
 
 
 def name_of(planted: Planted, system: str) -> str:
-    """:return: effect and place, as a diagnosis names them"""
+    """:return: effect and place, as a diagnosis reports them"""
     if planted.effect.startswith(PARAMETER):
         return planted.effect
     effect = "sign_flip" if planted.effect == "reversed_joint" else planted.effect
@@ -281,7 +282,7 @@ def name_of(planted: Planted, system: str) -> str:
 
 
 def _effect(case: Case, kind: str, rng: np.random.Generator, index: int | None = None) -> Planted:
-    """One effect of the catalogue, so many times as large as what would have shown."""
+    """One effect of the catalogue, with a size of ``case.factor`` detection limits."""
     system, rig, factor = case.system, RIGS[case.system], case.factor
     limits, wide = smallest(case), spread(system)
     side = float(rng.choice((-1.0, 1.0)))
@@ -334,18 +335,18 @@ def _effect(case: Case, kind: str, rng: np.random.Generator, index: int | None =
         sizes = {name: float(value) for name, value in values().items()}
     except KeyError:
         sizes = {}
-    # Of an effect that the diagnosis does not try here, no size is known.
+    # There is no detection limit for an effect that the diagnosis does not try here.
     return Planted(kind, index, sizes or {"size": np.nan})
 
 
 def _late(delay: float) -> float:
-    """A delay that the generator can make [s]: its steps are a millisecond."""
+    """Round a delay [s] to the steps of the engine, a millisecond."""
     return max(round(min(delay, 0.15), 3), 0.001) if np.isfinite(delay) else np.nan
 
 
 def _outside(case: Case, kind: str, rng: np.random.Generator) -> Planted:
-    """Something that no catalogue holds, in units of what would show of its nearest relative."""
-    joints, limits = believed(case.system).joints, smallest(case)
+    """An effect outside the catalogue, its size in detection limits of the most similar effect."""
+    joints, limits = nominal_twin(case.system).joints, smallest(case)
     index = int(rng.integers(len(joints)))
 
     def size(effect: str, name: str) -> float:
@@ -386,13 +387,13 @@ def _above_a_spring(q: np.ndarray, force: np.ndarray) -> float:
 
 @functools.cache
 def _positions(system: str) -> np.ndarray:
-    """:return: of all joints, where nothing is wrong"""
+    """:return: positions of all joints without planted effects"""
     obs, _ = simulate(RIGS[system], [], n_recordings=8, n_steps=N_STEPS, seed=1)
     return np.concatenate(obs)[:, : RIGS[system].dof]
 
 
 @functools.cache
-def believed(system: str, seen: str = "qv") -> Any:
+def nominal_twin(system: str, seen: str = "qv") -> Any:
     """
     :param seen: ``"q"`` if positions are observed only
     :return: the twin under diagnosis
@@ -401,7 +402,7 @@ def believed(system: str, seen: str = "qv") -> Any:
 
     name, values = RIGS[system].twin
     if system in FROM_FILES:
-        # Runge and Kutta's steps of 4 ms follow those of 1 ms, and cost a quarter.
+        # Runge-Kutta steps of 4 ms agree with those of 1 ms, at a quarter of the cost.
         made, dt = twins.from_mujoco(RIGS[system].xml), RIGS[system].dt
         return twins.MechanismTwin(made.mechanism, dt=dt, substeps=_SUBSTEPS, observe=seen)
     observe = {"observe": "q"} if seen == "q" else {}
@@ -411,12 +412,12 @@ def believed(system: str, seen: str = "qv") -> Any:
 def base_value(system: str) -> float:
     base = RIGS[system].base
     assert base is not None
-    return believed(system).values[base[0]]
+    return nominal_twin(system).values[base[0]]
 
 
 @functools.cache
 def spread(system: str) -> np.ndarray:
-    """:return: standard deviation of each channel where nothing is wrong"""
+    """:return: standard deviation of each channel without planted effects"""
     obs, _ = simulate(RIGS[system], [], n_recordings=8, n_steps=N_STEPS, seed=1)
     return np.concatenate(obs).std(0)
 
@@ -486,14 +487,18 @@ def smallest(case: Case) -> dict[str, dict[str, float]]:
 
         data, _ = recorded(nothing(case.system, case.noise, case.disturbance), seed=99)
         found = diagnose(
-            believed(case.system), data, calibrate=case.nuisances, budget="quick", progress=False
+            nominal_twin(case.system),
+            data,
+            calibrate=case.nuisances,
+            budget="quick",
+            progress=False,
         )
         write(path, json.dumps(found.to_dict()["detectable"]))
     return json.loads(path.read_text())
 
 
 def write(path: Path, text: str) -> None:
-    """All of it or nothing, whoever else writes the same."""
+    """Write atomically, also if several processes write the same file."""
     import os
 
     path.parent.mkdir(parents=True, exist_ok=True)

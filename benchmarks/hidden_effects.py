@@ -3,25 +3,26 @@ Detection and false-alarm rates of `diagnose` on data with and without hidden ef
 
     python benchmarks/hidden_effects.py --cases 1000 --jobs 2
     python benchmarks/hidden_effects.py --cases 100 --systems pendulum furuta --kinds null
-    python benchmarks/hidden_effects.py --report-only         # tables and figure of what has run
+    python benchmarks/hidden_effects.py --report-only         # tables and figure of finished cases
 
-Data come from `independent_rigs.py`; sensors round to their ticks or get white noise. The twin
-under diagnosis knows the rig but not what was planted, and follows the engine, where nothing is
-planted, to a tenth of the smallest noise: that is measured first, and nothing runs where it fails.
-Sizes are 2, 4 and 8 times what null data of the same rig, noise, disturbance and nuisances would
-have shown (`Diagnosis.detectable`); a few effects without a slope at zero have sizes of their own
-(`hidden_cases.py`). Names count as right only where and when they mean the same (`same_cause.py`).
+Data come from `independent_rigs.py`; sensors round to their ticks or have white noise. The twin
+under diagnosis describes the rig without the planted effects. Without any, it follows the engine to
+a tenth of the smallest noise: this is measured first, and nothing runs if it fails. Sizes are 2, 4
+and 8 times the detection limit (`Diagnosis.detectable`) of null data with the same rig, noise,
+disturbance and nuisance parameters; a few effects whose derivative vanishes at zero have sizes of
+their own (`hidden_cases.py`). An equivalent name counts as right only under its declared condition
+(`same_cause.py`).
 
-A case of a kind is the same however many are run. Each is kept as soon as it is finished; several
-runs at once may add to one table. Other rules, and the planted effects fitted from their truth, are
-tried on every fourth case of a kind. Beside the cases, one in fifty more asks about Pendulum-v1's
-Euler twin, which differs from the engine by half a step and by no friction, and one in a hundred
-about each of a six-joint arm and a three-joint leg whose twins come from their MJCFs, driven by
-torques and, as many, in closed loop by servos.
+A case of a kind does not depend on the number of cases. Each is saved as soon as it is finished;
+several runs at once may add to one table. On every fourth case of a kind, other rules and the
+planted effects fitted from their true values are evaluated as well. In addition, one case in fifty
+has the Euler twin of Pendulum-v1, which differs from the engine by half a step and by no friction,
+and one in a hundred each has a six-joint arm and a three-joint leg whose twins come from their
+MJCFs, driven by torques, and as many by servos in closed loop.
 
-Half of the cases with effects have two to nine at once (`several_cases.py`), and of these the arm
-and the leg have more than of all others. They are judged cause by cause (`several_scores.py`),
-beside others on the same data (`several_rules.py`).
+Half of the cases with effects have two to nine at once (`several_cases.py`); of the arm and the
+leg, most do. They are scored cause by cause (`several_scores.py`), and compared with other methods
+on the same data (`several_rules.py`).
 """
 
 import argparse
@@ -48,29 +49,29 @@ from hidden_cases import (
     RIGS,
     SHARES,
     Case,
-    believed,
     draw,
     kind_of,
+    nominal_twin,
     spread,
 )
 from hidden_scores import loaded, report
 from independent_rigs import FROM_FILES, SYSTEMS, Planted, simulate
-from other_rules import asked
+from other_rules import answers_of
 from runs import CACHE, RESULTS
 from same_cause import equals
 from several_scores import RULE as RULE_OF_SEVERAL
 from several_scores import SEVERAL
 
-# Cases of one system that one process works through, so that it compiles once.
+# Number of cases of one system that one process runs, so that it compiles once.
 BLOCK = 40
-# Of so many cases, one more is Euler's.
+# One additional case of the Euler twin for so many others.
 _EULER = 50
 # And one is of each rig whose twin comes from a model file, torques and servos apart: a diagnosis
 # of six joints takes minutes.
 _OF_FILES = 100
 # But of several causes, so many times as many: few joints are no measure of many.
 _MORE_OF_SEVERAL = 10
-# Share of the sensors' noise by which twin and engine may differ after a second.
+# Largest difference of twin and engine after a second, as a share of the sensor noise.
 _LEAST_MISMATCH = 0.1
 # Compiled programs take memory maps, of which Linux gives a process 65,530.
 _MAPS, _MOST_MAPS = Path("/proc/self/maps"), 20_000
@@ -123,7 +124,7 @@ def go(table: str, wanted: dict[str, list[int]], budget: str, jobs: int) -> int:
     done = {(row["system"], row["case"]) for row in read(table)}
     left = {s: [n for n in cases if (s, n) not in done] for s, cases in wanted.items()}
     longest = max(map(len, left.values()), default=0)
-    # Systems take turns, so that what has been run is at any time like the whole.
+    # Systems alternate, so that the finished cases are representative at any time.
     blocks = [
         (system, cases[first : first + BLOCK])
         for first in range(0, longest, BLOCK)
@@ -188,7 +189,7 @@ def read(table: str) -> list[dict[str, Any]]:
 
 
 def keep(table: str, row: dict[str, Any]) -> None:
-    """Add a row; a kill leaves the old table or the new one, and other runs may add theirs."""
+    """Add a row atomically; other runs may add theirs at the same time."""
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{table}.csv"
     CACHE.mkdir(exist_ok=True)
@@ -203,7 +204,7 @@ def keep(table: str, row: dict[str, Any]) -> None:
 
 
 def check_mismatch(systems: Sequence[str]) -> None:
-    """Print how far twin and engine are apart without any effect; leave if that is too far."""
+    """Print the difference of twin and engine without planted effects; exit if it is too large."""
     worst = _LEAST_MISMATCH * min(NOISES.values())
     found = {system: mismatch(system) for system in systems if system in {**SYSTEMS, **FROM_FILES}}
     for system, apart in found.items():
@@ -220,13 +221,13 @@ def check_mismatch(systems: Sequence[str]) -> None:
 
 
 def mismatch(system: str) -> float:
-    """Largest difference after a second, in units of each channel's spread, without effects."""
+    """Largest difference without effects after a second, in standard deviations of each channel."""
     import jax
     import jax.numpy as jnp
 
     from sb3_hds.core import rollout
 
-    twin, n = believed(system), round(1.0 / RIGS[system].dt)
+    twin, n = nominal_twin(system), round(1.0 / RIGS[system].dt)
     obs, actions = simulate(RIGS[system], [], n_recordings=8, n_steps=n, seed=2)
     with jax.enable_x64(True):
         start = jax.vmap(lambda o: twin.infer(o, twin.params))(jnp.array([o[0] for o in obs]))
@@ -250,7 +251,7 @@ def run(
 ) -> dict[str, Any]:
     """
     :param kind: instead of the one whose turn it is
-    :param noise: instead of the one that is dealt
+    :param noise: instead of the drawn one
     :param most: recordings
     :param rules: whether other rules are asked, and an oracle, where it is the case's turn
     :return: what was planted and what was said
@@ -262,7 +263,7 @@ def run(
         case, data, motion = several_cases.draw(system, number, noise=noise, most=most)
     else:
         case, data, motion = draw(system, number, kind=kind, noise=noise, most=most)
-    twin, started = believed(system, case.seen), time.time()
+    twin, started = nominal_twin(system, case.seen), time.time()
     inquiry = Inquiry(twin, data, effects.ALL, case.nuisances, number, budget, False)
     reason = inquiry.given.poor
     found = inquiry.refused(reason) if reason else inquiry.run()
@@ -275,7 +276,7 @@ def run(
     said = {}
     if case.kind == SEVERAL:
         said = of_several(case, inquiry.screened, found)
-    # A log in other conventions is told before anything is simulated.
+    # Other conventions are recognised before anything is simulated.
     wanted = rules and case.asked and not reason and inquiry.given.convention is None
     if wanted:
         said |= (
@@ -312,7 +313,7 @@ def run(
 
 
 def of_several(case: Case, screened: Any, found: Any) -> dict[str, Any]:
-    """How the data came about, which causes show in them, and every set that was named."""
+    """How the data were made, which causes are detectable in them, and every set that was named."""
     visible = (
         several_cases.visible(screened, case.truths) if screened else [True] * len(case.truths)
     )
@@ -329,8 +330,8 @@ def of_several(case: Case, screened: Any, found: Any) -> dict[str, Any]:
 def others_of_several(
     case: Case, inquiry: Any, data: Any, motion: np.ndarray, commands: np.ndarray, budget: str
 ) -> dict[str, str]:
-    """What other rules say, and what that means in these data."""
-    found = several_rules.asked(inquiry, believed(case.system, case.seen), data, budget)
+    """The answers of other methods, with the equivalent names in these data."""
+    found = several_rules.asked(inquiry, nominal_twin(case.system, case.seen), data, budget)
     return {
         f"{RULE_OF_SEVERAL}{rule}": json.dumps(
             {
@@ -344,21 +345,21 @@ def others_of_several(
 
 
 def _turned(convention: str) -> str:
-    """A wrong direction is told as a convention; what is planted then is a sign."""
+    """A reversed direction is reported as a convention; the planted effect is a sign."""
     kind, _, place = convention.partition(".")
     return f"sign_flip.{place}" if kind in ("direction", "command") else ""
 
 
 def others(inquiry: Any, case: Case) -> dict[str, Any]:
-    """What an oracle and other rules say of the same data."""
+    """The answers of an oracle and of other rules on the same data."""
     found: dict[str, Any] = {"oracle": oracle(inquiry, case) if case.truths else np.nan}
-    for rule, (name, gain) in asked(inquiry).items():
+    for rule, (name, gain) in answers_of(inquiry).items():
         found |= {f"rule: {rule}": name, f"gain: {rule}": gain}
     return found
 
 
 def estimates(case: Case, found: Any) -> dict[str, tuple[float, float, float, float]]:
-    """:return: of each parameter of a cause that was found: estimate, interval, truth"""
+    """:return: for each parameter of a found cause: estimate, ends of its interval, true value"""
     said = {}
     for finding in found.findings:
         for planted, truth in zip(case.planted, case.truths, strict=False):
@@ -375,7 +376,7 @@ def estimates(case: Case, found: Any) -> dict[str, tuple[float, float, float, fl
 
 
 def _turns(planted: Planted, name: str, estimate: float, true: float) -> float:
-    """A phase is as good a period later."""
+    """Shift a phase by whole periods towards its true value."""
     if (planted.effect, name) != ("cogging", "phase"):
         return 0.0
     period = planted.values["period"]
@@ -385,12 +386,12 @@ def _turns(planted: Planted, name: str, estimate: float, true: float) -> float:
 def true_value(planted: Planted, name: str, system: str) -> float | None:
     if name not in planted.values:
         return None
-    own = believed(system).values if planted.effect.startswith(PARAMETER) else {}
+    own = nominal_twin(system).values if planted.effect.startswith(PARAMETER) else {}
     return own.get(name, 0.0) + planted.values[name]
 
 
 def reached(found: Any) -> float:
-    """By which share what was found lowers held-out errors at the end of a window."""
+    """Share by which the found causes lower held-out errors at the end of a window."""
     if not found.gain:
         return np.nan
     last = found.gain[max(found.gain)]
@@ -398,7 +399,7 @@ def reached(found: Any) -> float:
 
 
 def oracle(inquiry: Any, case: Case) -> float:
-    """By which share the planted effects, fitted from their truth, lower held-out errors."""
+    """Share by which the planted effects, fitted from their true values, lower held-out errors."""
     search, h = inquiry.search, inquiry.hypotheses
     start = search.base(h.null, h.nuisances)
     theta, free = start.point.theta.copy(), [*start.free]

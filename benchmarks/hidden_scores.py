@@ -1,4 +1,4 @@
-"""The scores of `hidden_effects.py`: rates beside the targets, tables, a picture."""
+"""The scores of `hidden_effects.py`: rates and their targets, tables, a figure."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -7,30 +7,30 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from hidden_cases import EULERS, NULLS, SHARES
-from rates import Score, as_table, middle, share, sizes_of, told_share, wilson
+from rates import Score, as_table, middle, share, share_with_interval, sizes_of, wilson
 from runs import RESULTS
 from same_cause import right
 from several_scores import PARTS as PARTS_OF_SEVERAL
 from several_scores import RULE as RULE_OF_SEVERAL
 from several_scores import SEVERAL
 
-#: what Euler's twin may be told: that something is late by half a step, or that something is wrong
+#: names that are right for the Euler twin, beside the verdict `unknown`: it is half a step late
 LATE = ("sensor_delay", "action_delay")
 VERDICTS = ("named", "ambiguous", "none", "unknown", "not_identifiable")
-# What a diagnosis may take [s].
+# Target for the time of a diagnosis [s].
 _SECONDS = {"full": 60.0, "quick": 15.0}
 _RULE, _GAIN = "rule: ", "gain: "
 _TEXTS = ("truth", "same", "verdict", "named", "set", "more", "moved", "estimate")
 
 
 def loaded(path: Path) -> pd.DataFrame:
-    """:return: a table in which "null" is a word"""
+    """:return: the table, with "null" as text instead of a missing value"""
     return pd.read_csv(path, keep_default_na=False, na_values=[""])
 
 
 def prepared(table: pd.DataFrame) -> pd.DataFrame:
-    """With what follows from each row: whether a name was given, whether it and all are right."""
-    # A column without any word looks like one of numbers.
+    """Add to each row whether a name was given, and whether that name and all names are right."""
+    # pandas reads a text column without any text as numbers.
     texts = [name for name in table if name in _TEXTS or name.startswith((_RULE, RULE_OF_SEVERAL))]
     table = table.assign(**{name: table[name].astype(object).fillna("") for name in texts})
     judged = lambda column: [_right(row, row[column]) for _, row in table.iterrows()]  # noqa: E731
@@ -90,23 +90,27 @@ def scores(table: pd.DataFrame, budget: str) -> list[Score]:
         share("refused: outside the catalogue", ~outside["spoke"], least=0.9),
         share("called unknown: outside the catalogue", outside["verdict"] == "unknown", least=0.9),
         share("refused: standing still", still["verdict"] == "not_identifiable", least=1.0),
-        share("pairs: one of them is named", hits),
-        share("pairs: both are", both),
+        share("pairs: one cause named", hits),
+        share("pairs: both named", both),
     ]
     covered, errors = sizes_of(effects)
     found += [
-        share("90 % intervals that cover", covered, least=0.85, most=0.95),
+        share("90 % intervals that cover the truth", covered, least=0.85, most=0.95),
         middle("error of a parameter, median", errors),
-        middle("error of a parameter, 90 % of them", errors, 0.9),
-        middle("gain over the oracle's, median", said["at_the_end"] / said["oracle"], least=0.9),
+        middle("error of a parameter, 90th percentile", errors, 0.9),
+        middle(
+            "gain relative to the true effect, median",
+            said["at_the_end"] / said["oracle"],
+            least=0.9,
+        ),
         middle("seconds, median", cases["seconds"]),
-        middle("seconds, 90 % of them", cases["seconds"], 0.9, most=_SECONDS[budget]),
+        middle("seconds, 90th percentile", cases["seconds"], 0.9, most=_SECONDS[budget]),
     ]
     return found + _eulers(table[table["kind"] == EULERS])
 
 
 def _eulers(rows: pd.DataFrame) -> list[Score]:
-    """Half a step late, or unknown, and never a friction."""
+    """Right are a delay or `unknown`, and never a friction."""
     names = [[n for n in f"{r['set']};{r['more']}".split(";") if n] for _, r in rows.iterrows()]
     late = [
         bool(own or moved) and all(name.startswith(LATE) for name in own)
@@ -115,13 +119,13 @@ def _eulers(rows: pd.DataFrame) -> list[Score]:
     answered = (rows["verdict"] == "unknown") | np.array(late, bool)
     friction = [any("friction" in name or "drag" in name for name in own) for own in names]
     return [
-        share(f"{EULERS}: late or unknown", answered, least=1.0),
+        share(f"{EULERS}: delay or unknown", answered, least=1.0),
         share(f"{EULERS}: friction named", friction, most=0.0),
     ]
 
 
 def by_difficulty(table: pd.DataFrame) -> pd.DataFrame:
-    """Right names of single effects by what disturbs them and by their size."""
+    """Rates of single effects by noise, disturbance and size."""
     effects, rows = table[table["kind"] == "effect"], []
     for label, own in (
         ("white, up to 1 %", ~effects["disturbed"] & (effects["noise"] != "5 %")),
@@ -131,7 +135,9 @@ def by_difficulty(table: pd.DataFrame) -> pd.DataFrame:
     ):
         for factor in (2.0, 4.0, 8.0):
             some = effects[own & (effects["factor"] == factor)]
-            rows.append({"noise": label, "times": f"{factor:.0f}"} | _told(some))
+            rows.append(
+                {"noise": label, "size [detection limits]": f"{factor:.0f}"} | _rates_of(some)
+            )
     return pd.DataFrame(rows)
 
 
@@ -139,7 +145,7 @@ def by_cause(table: pd.DataFrame) -> pd.DataFrame:
     """The same for each effect."""
     effects = table[table["kind"] == "effect"]
     effects = effects.assign(effect=effects["truth"].str.replace(r"\.[^.]*$", "", regex=True))
-    rows = [{"effect": name} | _told(own) for name, own in effects.groupby("effect")]
+    rows = [{"effect": name} | _rates_of(own) for name, own in effects.groupby("effect")]
     return pd.DataFrame(rows)
 
 
@@ -149,10 +155,10 @@ def by_system(table: pd.DataFrame) -> pd.DataFrame:
         nulls, outside = own[own["kind"].isin(NULLS)], own[own["kind"] == "outside"]
         rows.append(
             {"system": name}
-            | _told(own[own["kind"] == "effect"])
+            | _rates_of(own[own["kind"] == "effect"])
             | {
-                "false alarms": told_share(nulls["spoke"]),
-                "refused outside": told_share(~outside["spoke"]),
+                "false alarms": share_with_interval(nulls["spoke"]),
+                "refused outside the catalogue": share_with_interval(~outside["spoke"]),
                 "seconds": f"{own['seconds'].median():.0f}",
             }
         )
@@ -164,6 +170,8 @@ def by_kind(table: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for kind in (*SHARES, EULERS):
         own = table[table["kind"] == kind]
+        if own.empty:
+            continue
         counts = own["verdict"].value_counts()
         rows.append(
             {"kind": kind, "cases": len(own)}
@@ -178,15 +186,15 @@ def by_outside(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "cause": name.replace("_", " "),
-            "refused": told_share(~own["spoke"]),
-            "as unknown": told_share(own["verdict"] == "unknown"),
+            "refused": share_with_interval(~own["spoke"]),
+            "called unknown": share_with_interval(own["verdict"] == "unknown"),
         }
         for name, own in outside.groupby("truth")
     )
 
 
 def by_rule(table: pd.DataFrame) -> pd.DataFrame:
-    """Peers, and `diagnose` itself, on the cases that all were asked about."""
+    """Compare other rules with `diagnose` on the cases that all of them were applied to."""
     asked = table[table["asked"].astype(bool) & (table["kind"] != SEVERAL)]
     rules = [name.removeprefix(_RULE) for name in table if name.startswith(_RULE)]
     rows = [_of_rule("diagnose", asked, asked["named"], asked["at_the_end"])]
@@ -203,20 +211,21 @@ def _of_rule(rule: str, asked: pd.DataFrame, names: pd.Series, gains: pd.Series)
         bool,
     )
     ratio = (gains / asked["oracle"])[effect & spoke]
+    median = f"{np.nanmedian(ratio):.2f}" if ratio.notna().any() else "-"
     return {
         "rule": rule,
-        "false alarms": told_share(spoke[asked["kind"].isin(NULLS)]),
-        "named outside": told_share(spoke[asked["kind"] == "outside"]),
-        "right": told_share(good[effect]),
-        "wrong": told_share((spoke & ~good)[effect]),
-        "gain over the oracle's": f"{np.nanmedian(ratio):.2f}" if ratio.notna().any() else "-",
+        "false alarms": share_with_interval(spoke[asked["kind"].isin(NULLS)]),
+        "named outside the catalogue": share_with_interval(spoke[asked["kind"] == "outside"]),
+        "right": share_with_interval(good[effect]),
+        "wrong": share_with_interval((spoke & ~good)[effect]),
+        "gain relative to the true effect": median,
     }
 
 
-def _told(rows: pd.DataFrame) -> dict[str, str]:
+def _rates_of(rows: pd.DataFrame) -> dict[str, str]:
     return {
-        "right": told_share(rows["right"]),
-        "to the letter": _share(rows["truth"] == rows["named"]),
+        "right": share_with_interval(rows["right"]),
+        "exact name": _share(rows["truth"] == rows["named"]),
         "within the set": _share(rows["within"][rows["spoke"]]),
         "wrong": _share(rows["spoke"] & ~rows["right"]),
         "none": _share(rows["verdict"] == "none"),
@@ -298,7 +307,7 @@ def figure(found: Sequence[Score], table: pd.DataFrame, name: str) -> None:
     middle_.set_xscale("log", base=2)
     middle_.set_xticks((2, 4, 8), ("2", "4", "8"))
     middle_.set_ylim(0.0, 1.03)
-    middle_.set_xlabel("size, in units of the smallest that shows")
+    middle_.set_xlabel("size, in detection limits")
     middle_.set_ylabel("right name")
     middle_.legend(frameon=False)
     drawing.savefig(RESULTS / f"{name}.png", dpi=150)

@@ -1,10 +1,11 @@
 """
-The import time of the package beside its peers.
+The import time of the package compared with its peers.
 
     python benchmarks/import_time.py
 
-Fresh interpreters, the peers one after another in each round, so that a slow moment hits all.
-``ratio`` compares medians to gymnasium, which registers the environments' ids.
+Each import is a fresh interpreter; the packages alternate within each round, so that a slow moment
+affects all. ``ratio`` compares medians to that of gymnasium, which registers the ids of
+environments.
 """
 
 import argparse

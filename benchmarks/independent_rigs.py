@@ -1,10 +1,10 @@
 """
-Rigs on MuJoCo's C engine, with effects planted that are computed here, not by the product.
+Rigs on MuJoCo's C engine, with planted effects that this file computes by itself.
 
-Each rig is one XML file, stepped every millisecond. Forces of effects go through MuJoCo's own
-damping, dry friction and springs where it has them, and otherwise through `qfrc_applied`, which is
-recomputed before each step; commands and measurements are changed on their way in and out. What
-parameters mean is what the catalogue says they mean; how they are computed is not.
+Each rig is one XML file, stepped every millisecond. Forces of effects use MuJoCo's own damping, dry
+friction and springs where it has them, and otherwise `qfrc_applied`, which is recomputed before
+each step; effects of actuators and sensors change commands and measurements. Parameters have the
+meaning that the catalogue gives them; the computation is separate.
 """
 
 import functools
@@ -19,14 +19,14 @@ import numpy as np
 _STEP = 0.001  # [s]
 #: how the names of parameters end that are the inertia of a joint's rotor
 ARMATURE = "_armature"
-#: index of what all motors share, such as a late bus
+#: index of an effect that all motors share, such as a late bus
 EVERYWHERE = -1
-# Sines of which a set point is made, and between which frequencies they are [Hz].
+# Number of sines in a set point, and the range of their frequencies [Hz].
 _SINES, _SLOWEST, _FASTEST = 3, 0.2, 1.2
 # The engine's dry friction is a damper up to where it brakes at this time constant [s] and ratio.
 # Its default of 20 ms would let rigs creep: these are the hardest that its step bears.
 _DRY = (2.0 * _STEP, 1.0)
-# A recording that is not below this, in any channel, has diverged.
+# A recording with a larger value in any channel has diverged.
 _TOO_FAR = 1e4
 
 _HEAD = '<mujoco><option timestep="0.001" integrator="RK4" gravity="0 0 -9.81"/>'
@@ -209,8 +209,8 @@ SYSTEMS = {
         2.0,
     ),
 }
-#: Pendulum-v1 in continuous time: its twin steps by Euler's rule, and is not to be blamed on
-#: friction
+#: Pendulum-v1 in continuous time, for its twin with semi-implicit Euler steps: friction is a wrong
+#: name for the difference
 EULER = System(
     _ROD,
     ("Pendulum", {}),
@@ -287,7 +287,7 @@ FROM_FILES = {
 
 
 class DivergedError(RuntimeError):
-    """What was planted is no machine that could be recorded."""
+    """The planted effects make the rig diverge."""
 
 
 @dataclass(frozen=True)
@@ -324,7 +324,7 @@ def _sign(v: float) -> float:
 
 
 def _hysteresis(at: Moment, stiffness: float, slip: float) -> float:
-    """A bristle that bends with the motion, and slips the more the farther it is bent (Dahl)."""
+    """Friction of a bristle that bends with the motion, and slips more the more it bends (Dahl)."""
     bent = at.memory.get("bent", 0.0)
     at.memory["bent"] = bent + _STEP * (at.v - abs(at.v) * bent / slip)
     return -stiffness * at.memory["bent"]
@@ -367,7 +367,7 @@ OUTSIDE = (
 )
 
 
-# In the order in which a command meets them.
+# In the order in which they act on a command.
 COMMANDS = (
     "action_delay",
     "dead_zone",
@@ -379,7 +379,7 @@ COMMANDS = (
 
 
 class Commands:
-    """What happens to a command on its way in."""
+    """Apply the effects of an actuator to its command."""
 
     def __init__(self, planted: list[Planted]) -> None:
         mine = (p for p in planted if p.effect in COMMANDS)
@@ -456,7 +456,7 @@ SENSORS = ("sensor_bias", "sensor_scale", "sensor_delay", "sign_flip", "reversed
 
 
 def can_change(system: System, change: float) -> bool:
-    """:return: whether the body that ``base`` names stays a body if it changes by so much"""
+    """:return: whether the inertia of the body of ``base`` is physical after this change"""
     if system.base is None:
         return change == 0.0
     _, body, what = system.base
@@ -504,7 +504,7 @@ def simulate(
 
 
 def modelled(system: System, planted: list[Planted], base_change: float = 0.0) -> Any:
-    """:return: the engine's model, with what it can do by itself of what was planted"""
+    """:return: the engine's model, with those planted effects that it supports itself"""
     xml = system.xml
     for p in planted:
         if p.effect in TRANSMISSIONS:
@@ -587,7 +587,7 @@ def _moment(model: Any, data: Any, system: System, i: int, memory: dict[str, flo
 def _measured(
     fine: np.ndarray, planted: list[Planted], system: System, per_step: int
 ) -> np.ndarray:
-    """What sensors make of the motion: they are late first, and then wrong."""
+    """Apply the effects of sensors to the motion: delays first, then errors."""
     obs = fine[::per_step].copy()
     for p in (p for p in planted if p.effect == "sensor_delay"):
         late = np.arange(len(obs)) * per_step - round(p.values["delay"] / _STEP)

@@ -1,31 +1,30 @@
 """
-The cost of a diagnosis against the number of joints.
+The time and memory of a diagnosis against the number of joints.
 
     python benchmarks/joints_cost.py
     python benchmarks/joints_cost.py --joints 1 6 --budgets quick
     python benchmarks/joints_cost.py --joints 6 --budgets quick --seconds 3600 --rate 1000
     python benchmarks/joints_cost.py --report-only
 
-Arms of 1 to 12 hinges on MuJoCo's engine, 30 s at 125 Hz (or as asked) of smooth random torques,
-positions and velocities with noise. Every joint has viscous and dry friction that the model file
-lacks. Each row is a fresh process with nothing compiled beforehand; starting Python and making the
-data do not count. Processor seconds are those of all cores, and hardly depend on what else the
-machine does.
-Proposals are done when the whole set of causes is known by the equation of motion; the verdict,
-when it has been judged by simulation.
+The data are of arms of 1 to 12 hinges on MuJoCo's engine: smooth random torques for 30 s at 125 Hz,
+or as given, with noise on positions and velocities. Every joint has viscous and dry friction that
+the model file lacks. Each row is a fresh process with an empty compilation cache; starting Python
+and making the data do not count. Processor seconds are the sum over all cores and hardly depend on
+other load. Proposals are complete when the set of causes is known from the equation of motion; the
+verdict, when simulation has confirmed or rejected it.
 """
 
 import argparse
-import json
 import os
 import resource
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from model_files import arm
-from runs import RESULTS, fresh_process, resume, seconds_since_start
+from runs import RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 JOINTS = (1, 2, 3, 6, 12)
 BUDGETS = ("quick", "full")
@@ -44,23 +43,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=int, default=_SECONDS)
     parser.add_argument("--rate", type=int, default=_RATE, choices=(125, 250, 500, 1000))
     parser.add_argument("--report-only", action="store_true")
-    parser.add_argument("--worker", nargs=4, metavar=("JOINTS", "SECONDS", "RATE", "BUDGET"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        *numbers, budget = arguments.worker
-        print(json.dumps(worker(*map(int, numbers), budget)))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.report_only:
         given = arguments.seconds, arguments.rate
         wanted = [(n, *given, budget) for n in arguments.joints for budget in arguments.budgets]
-        resume(
-            "joints_cost", ("joints", "seconds", "rate [Hz]", "budget"), wanted, measured, jobs=1
-        )
+        keys = ("joints", "seconds", "rate [Hz]", "budget")
+        resume("joints_cost", keys, wanted, partial(fresh_process, __file__), jobs=1)
     print(pd.read_csv(RESULTS / "joints_cost.csv").to_string(index=False, float_format="%.3g"))
-
-
-def measured(joints: int, seconds: int, rate: int, budget: str) -> list[dict]:
-    return [fresh_process(__file__, joints, seconds, rate, budget)]
 
 
 def recorded(joints: int, seconds: int, rate: int) -> Any:

@@ -1,26 +1,27 @@
 """
-The cost of a twin from a model file, against the number of its joints and of its rows.
+The cost of a twin from a model file, against the number of joints and of rows.
 
     python benchmarks/model_files.py
     python benchmarks/model_files.py --joints 1 7 30 --rows 64
     python benchmarks/model_files.py --report-only
 
-Arms of 1 to 30 hinges, MuJoCo's implicitfast of 2 ms, in double precision. One row is a state with
-a command: a step, or a step with its derivatives by state and command. Each number of joints is a
-fresh process that compiles from nothing on one core; the fastest of five calls counts, in processor
-time of that process. Beside it, what the C engine takes for a step.
+The models are arms of 1 to 30 hinges with MuJoCo's implicitfast integrator at 2 ms, in double
+precision. A row is a state with a command; its cost is that of a step, or of a step with its
+derivatives by state and command. Each number of joints is a fresh process with an empty compilation
+cache on one core; the fastest of five calls counts, in processor time. A step of the C engine is
+measured for comparison.
 """
 
 import argparse
-import json
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from runs import RESULTS, fresh_process, resume
+from runs import RESULTS, arguments_of, fresh_process, resume
 
 JOINTS = (1, 2, 4, 7, 12, 20, 30)
 ROWS = (64, 1024)
@@ -35,20 +36,12 @@ def main() -> None:
     parser.add_argument("--joints", nargs="*", type=int, default=list(JOINTS))
     parser.add_argument("--rows", nargs="*", type=int, default=list(ROWS))
     parser.add_argument("--report-only", action="store_true")
-    parser.add_argument("--worker", nargs=2, metavar=("JOINTS", "ROWS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        print(json.dumps(worker(*map(int, arguments.worker))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.report_only:
         os.environ["XLA_FLAGS"] = _ONE_CORE
         wanted = [(n, rows) for n in arguments.joints for rows in arguments.rows]
-        resume("model_files", ("joints", "rows"), wanted, measured, jobs=1)
+        resume("model_files", ("joints", "rows"), wanted, partial(fresh_process, __file__), jobs=1)
     print(pd.read_csv(RESULTS / "model_files.csv").to_string(index=False, float_format="%.3g"))
-
-
-def measured(joints: int, rows: int) -> list[dict]:
-    return [fresh_process(__file__, joints, rows)]
 
 
 def arm(joints: int) -> str:

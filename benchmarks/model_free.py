@@ -1,34 +1,32 @@
 """
-The model-free family beside SB3, SB3-contrib and SBX: return against steps and against wall time.
+Model-free algorithms compared with SB3, SB3-Contrib and SBX: return against steps and wall time.
 
     python benchmarks/model_free.py                                   # Pendulum-v1, five seeds
     python benchmarks/model_free.py --env MountainCarContinuous-v0 --seeds 2 --methods td7 bro
-    python benchmarks/model_free.py --figure                          # tables and figures again
+    python benchmarks/model_free.py --figure                          # rebuild tables and figures
 
-Ours run with their file in `hyperparams/`, the others with what RL Zoo has for SAC, TQC and CrossQ
-on that environment (those of -v4 for -v5; SBX's DroQ: that of SAC with its documented arguments;
-SB3's gSDE: that of SAC with what ours has on Pendulum-v1).
-`sac` is our GSDESAC without gSDE, `bro_fast` BRO with two updates per step; the critics of
-`crossq_jax_512` have the default width of the constructor, a quarter of the paper's, those of
-`crossq_jax_narrow` an eighth of it, those of `simba_narrow` (with four times
-the learning rate) and `bro_fast_narrow` a quarter, those of `tqc_jax_narrow` two layers of 256 for
-three of 512, which two cores can bear. HDS, which knows a simulation of Pendulum-v1,
-stands beside them with the few steps of its own file. Each run is a fresh process; training stops
-for each evaluation, whose time does not count. `seconds` of the runs are those of their days: the
-tables have what `model_free_pace.py` makes of them. On Pendulum-v1, policies start from the 500
-states whose best return is known (SB3_HDS_DATA); elsewhere, ten episodes with the same seeds.
-Learners that only stop at the end of an episode may have made more steps than the mark at which
-they are compared. Finished runs are kept: an interrupted benchmark goes on where it stopped. Of the
-long runs, which are not those of Pendulum-v1, model and replay buffer are kept at every mark; one
-that is interrupted goes on from its last mark, with a new episode and random numbers other than
-those it would have had.
+Ours run with their file in `hyperparams/`, the others with RL Zoo's hyperparameters of SAC, TQC and
+CrossQ for that environment (those of -v4 for -v5; SBX's DroQ: those of SAC with its documented
+arguments; SB3's gSDE: those of SAC with our gSDE arguments for Pendulum-v1). `sac` is our GSDESAC
+without gSDE, `bro_fast` BRO with two updates per step. The critics of `crossq_jax_512` have the
+default width of the constructor, a quarter of the paper's, those of `crossq_jax_narrow` an eighth
+of it, those of `simba_narrow` (with four times the learning rate) and `bro_fast_narrow` a quarter;
+those of `tqc_jax_narrow` have two layers of 256 instead of three of 512, which two cores can
+compute. HDS, which knows a simulation of Pendulum-v1, is run with the few steps of its own file.
+
+Each run is a fresh process; training stops for each evaluation, whose time does not count.
+`seconds` of the runs depend on the day; the tables use the times of `model_free_pace.py`. On
+Pendulum-v1, policies start from the 500 states whose best return is known (SB3_HDS_DATA);
+elsewhere, from ten resets with the same seeds. Learners that only stop at the end of an episode may
+have made more steps than the mark at which they are compared. Finished runs are kept, so an
+interrupted benchmark resumes. Long runs, on all tasks but Pendulum-v1, save model and replay buffer
+at every mark, from which an interrupted run resumes with a new episode and other random numbers.
 """
 
 import argparse
 import importlib
-import json
 import time
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +34,7 @@ import numpy as np
 import yaml
 from episodes import returns_of
 from pendulum import held_out_states, rollouts
-from runs import CACHE, InterruptedRun, fresh_process, resume
+from runs import CACHE, InterruptedRun, arguments_of, fresh_process, resume
 
 PENDULUM = "Pendulum-v1"
 CAR, CART_POLE = "MountainCarContinuous-v0", "InvertedPendulum-v5"
@@ -53,8 +51,8 @@ LENGTHS = {
 class Ours(NamedTuple):
     """
     :param file: id in the zoo, whose hyperparameters are used
-    :param changes: to them
-    :param peers: methods that are the same elsewhere; without an equal, what it improves on
+    :param changes: changed hyperparameters
+    :param peers: the same method in other libraries; if there is none, the one that it improves on
     """
 
     file: str
@@ -65,7 +63,7 @@ class Ours(NamedTuple):
 class Peer(NamedTuple):
     """
     :param file: of RL Zoo, whose hyperparameters are used
-    :param changes: to them
+    :param changes: changed hyperparameters
     """
 
     library: str
@@ -141,12 +139,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("ENV", "METHOD", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env, method, seed = arguments.worker
-        print(json.dumps({"rows": worker(env, method, int(seed))}))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (arguments.env, method, seed)
@@ -154,7 +147,7 @@ def main() -> None:
             for method in arguments.methods
             if arguments.env in ONLY_ON.get(method, LENGTHS)
         ]
-        in_process = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+        in_process = partial(fresh_process, __file__, cache=CACHE)
         resume("model_free", KEYS, wanted, in_process, arguments.jobs, through)
     from model_free_report import report
 
@@ -162,7 +155,7 @@ def main() -> None:
 
 
 def through(run: tuple[Any, ...], rows: list[dict[str, Any]]) -> bool:
-    """:return: whether a run has come to its last mark, or was stopped before"""
+    """:return: whether a run reached its last mark, or was deliberately stopped before"""
     env, method, _ = run
     return max(row["mark"] for row in rows) >= marks(env, method)[-1]
 
@@ -197,7 +190,7 @@ def marks(env: str, method: str) -> range:
 
 
 def learner(env: str, method: str, seed: int) -> Any:
-    """:return: a model that has not learned yet"""
+    """:return: an untrained model"""
     return class_of(env, method)("MlpPolicy", env, seed=seed, **made_of(env, method)[1])
 
 
@@ -275,7 +268,7 @@ def _zoo_file(name: str) -> Path:
 
 
 def evaluation(env: str):
-    """:return: model to returns, from the same start states for all"""
+    """:return: function from a model to its returns, from the same start states for all"""
     if env == PENDULUM:
         angles, speeds, _ = held_out_states()
         return lambda model: rollouts(model, angles, speeds)

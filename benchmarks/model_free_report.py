@@ -1,8 +1,8 @@
 """
-The tables and figures of ``model_free.py``: each method beside its peers and its paper.
+The tables and figures of ``model_free.py``: each method compared with its peers and its paper.
 
-Intervals are those of means over seeds (see ``intervals.py``): of five seeds they are rough, of two
-little more than the spread.
+Intervals are those of means over seeds (see ``intervals.py``): rough for five seeds, and for two
+little more than the range.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from runs import RESULTS
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: return that every method shall reach; Gymnasium's own of the two small tasks
+#: target return of every method; that of Gymnasium for the two small tasks
 TARGETS = {PENDULUM: -150.0, CAR: 90.0, CART_POLE: 950.0}
 #: mean and standard deviation over seeds, and their number, after some of the steps after which
 #: ours are evaluated, on the tasks of -v4 for ours of -v5: from `results/baseline` and
@@ -73,7 +73,7 @@ def report() -> None:
 
 
 def in_order(runs: pd.DataFrame) -> pd.DataFrame:
-    """:return: the same rows, by environment and method, in whatever order they were run"""
+    """:return: the same rows, sorted by environment and method"""
     for column, order in (("method", [*OURS, *PEERS]), ("env", list(LENGTHS))):
         runs = runs.sort_values(column, key=lambda names: names.map(order.index), kind="stable")
     return runs.reset_index(drop=True)
@@ -82,7 +82,7 @@ def in_order(runs: pd.DataFrame) -> pd.DataFrame:
 def wall_seconds(runs: pd.DataFrame, paces: pd.DataFrame) -> pd.Series:
     """
     :param paces: of the methods, from ``model_free_pace.py``
-    :return: of each row, seconds that training takes up to there, all on one day; nan: no pace
+    :return: for each row, seconds of training up to its mark; nan where the pace was not measured
     """
     rows = runs[["env", "method", "steps"]].merge(paces, "left", ["env", "method"])
     begun = (rows["steps"] / rows["first_steps"]).clip(upper=1.0) * rows["first_s"]
@@ -129,7 +129,11 @@ def beside_peers(runs: pd.DataFrame) -> pd.DataFrame:
                 their_mean, their_low, _ = intervals.of_mean(theirs)
                 difference, low, high = intervals.of_difference(mine, theirs)
                 row = {"env": env, "method": method, "peer": peer, "mark": at}
-                row |= {"return": mine.mean(), "of_peer": their_mean, "low_of_peer": their_low}
+                row |= {
+                    "return": mine.mean(),
+                    "return_of_peer": their_mean,
+                    "low_of_peer": their_low,
+                }
                 row |= {"difference": difference, "low": low, "high": high}
                 row |= {
                     "probability_of_improvement": intervals.probability_of_improvement(mine, theirs)
@@ -181,29 +185,29 @@ def fewer_steps(runs: pd.DataFrame) -> pd.DataFrame:
             goals |= {goal: median_first_mark(theirs, goal) for goal in GOALS.get(env, ())}
             for goal, theirs_needs in goals.items():
                 needs = median_first_mark(mine, goal)
-                row = {"env": env, "method": method, "than": other, "goal": goal, "steps": needs}
-                row |= {"steps_of_other": theirs_needs, "times": theirs_needs / needs}
+                row = {"env": env, "method": method, "peer": other, "target": goal, "steps": needs}
+                row |= {"steps_of_peer": theirs_needs, "ratio": theirs_needs / needs}
                 seeds = f"{mine['seed'].nunique()} and {theirs['seed'].nunique()}"
                 rows.append(row | {"seeds": seeds})
     return pd.DataFrame(rows)
 
 
 def median_first_mark(some: pd.DataFrame, goal: float) -> float:
-    """:return: median over seeds of the first mark at which each is no less; nan: never so far"""
+    """:return: median over seeds of the first mark at which each reaches the goal; nan: never"""
     reached = (run.loc[run["return"] >= goal, "mark"] for _, run in some.groupby("seed"))
     median = np.median([min(marks, default=np.inf) for marks in reached])
     return float(median) if np.isfinite(median) else np.nan
 
 
 def first_mark(some: pd.DataFrame, goal: float) -> float:
-    """:return: the first mark at which the mean over seeds is no less; nan: none"""
+    """:return: the first mark at which the mean over seeds reaches the goal; nan: none"""
     means = some.groupby("mark")["return"].mean()
     reached = means.index[means >= goal]
     return float(reached[0]) if len(reached) else np.nan
 
 
 def common_mark(some: pd.DataFrame, *methods: str) -> int | None:
-    """:return: the last mark that all their runs have; None: there is none"""
+    """:return: the last mark that all runs of these methods have; None: there is none"""
     if not set(methods) <= set(some["method"]):
         return None
     runs = some[some["method"].isin(methods)].groupby(["method", "seed"])

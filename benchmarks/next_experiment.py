@@ -1,28 +1,30 @@
 """
-Whether one more recording settles what was ambiguous: designed, or a chirp, a random smooth signal
-or a pseudo-random binary sequence of the same length, within the same limits.
+Does one more recording settle an ambiguous verdict? The designed one compared with three others.
 
     python benchmarks/next_experiment.py --systems pendulum linear_axis --cases 40
     python benchmarks/next_experiment.py --report-only
 
-Cases have one planted cause, drawn as `hidden_effects.py` draws them, but so that data leave more
-open: twice as large as would just show, with sensors' errors of 5 % and six recordings at most.
-Only causes that have near relatives are taken, and the diagnosis is asked about these: friction and
-drag; what is late; gain, scale and, as always, the twin's own parameters. Where it ends ambiguous,
-one recording is made on the engine for each kind of command, from rest, and the answers are weighed
-by it (`Diagnosis.decided_by`). Limits are what the case's own recordings took, and a quarter more,
-and the rig's typical command; the three other signals are made as large as the limits allow under
-every answer.
+The others are a chirp, a smooth random signal and a pseudo-random binary sequence (PRBS) of the
+same length, within the same limits.
 
-`open`: the planted cause, or a name that means the same in these recordings (`same_cause.py`), is
-among the answers. `needed`: designed recordings that tell it from every other answer with a chance
-of 90 %, by the tool's own account; `tellable`: a hundred at most. `settled`: after one recording it
-has 95 % of the weight; `wrong`: other names have. `broken`: the largest share of a limit that the
-real rig took.
+Cases have one planted cause, drawn as in `hidden_effects.py`, but with data that leave more open:
+at twice the detection limit, with sensor errors of 5 % and six recordings at most. Only causes with
+similar alternatives are planted, and only these are candidates: friction and drag; delays and lags;
+gain, scale and, as always, the twin's own parameters. If the verdict is ambiguous, the engine makes
+one recording from rest for each kind of command, and the explanations are weighted by it
+(`Diagnosis.decided_by`). Limits are those of the case's own recordings plus a quarter, and the
+rig's typical command; the three other signals are as large as the limits allow under every
+explanation.
 
-`inside`: of every case that is diagnosed, ambiguous or not, another recording of the rig is held
-out: the share of its instants within the central 90 % of what the draws of `Diagnosis.belief`
-predict from its start on, with the errors that the best answer leaves added.
+`open`: the planted cause, or an equivalent name (`same_cause.py`), is among the explanations.
+`needed`: number of designed recordings that separate it from every other explanation with a
+probability of 90 %, by the tool's estimate; `tellable`: a hundred at most. `settled`: after one
+recording it has 95 % of the weight; `wrong`: another name has. `broken`: the largest share of a
+limit that the real rig reached.
+
+`inside`: for every diagnosed case, ambiguous or not, another recording of the rig is held out; the
+share of its samples within the central 90 % of what the draws of `Diagnosis.belief` predict from
+its start, with the residual errors of the best explanation added.
 """
 
 import argparse
@@ -39,7 +41,17 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from hidden_cases import N_STEPS, RIGS, believed, dealt, draw, plantable, recorded, sensed, spread
+from hidden_cases import (
+    N_STEPS,
+    RIGS,
+    draw,
+    from_deck,
+    nominal_twin,
+    plantable,
+    recorded,
+    sensed,
+    spread,
+)
 from hidden_effects import key
 from independent_rigs import Loop, simulate
 from runs import RESULTS, save
@@ -48,7 +60,7 @@ from scipy.special import ndtr
 
 _TABLE = RESULTS / "next_experiment.csv"
 SIGNALS = ("designed", "chirp", "random smooth", "PRBS")
-# What makes data leave more open.
+# Settings with which data leave more open.
 _NOISE, _RECORDINGS = "5 %", 6
 _FACTOR, _FACTORS = 2.0, (2.0, 4.0, 8.0)
 _FAMILIES = (
@@ -62,21 +74,21 @@ _FAMILIES = (
 )
 # Recordings that are held out, what numbers them apart, and the tails beyond the band.
 _HELD_OUT, _SEED, _TAIL = 2, 1_000_000, 0.05
-# Recordings beyond which the tool says that commands do not tell.
+# Number of recordings beyond which the tool says that no command decides.
 _MOST_RECORDINGS = 100
-# What a machine may do beyond what its recordings show.
+# Limits of a machine relative to what its recordings reach.
 _ROOM = 1.25
 # Share of a limit that other signals take at most, as the designed one does, and how finely their
 # size is sought.
 _MOST, _HALVINGS = 0.9, 7
-# Weight from which a question is settled.
+# Weight at which a question counts as settled.
 _SURE = 0.95
-# Sampling intervals that a level of a binary sequence lasts.
+# Sampling intervals per level of a binary sequence.
 _LEVEL = 5
 
 
 class Played(Loop):
-    """Commands that are given: no loop at all."""
+    """Given commands, without a loop."""
 
     def set_points(self, rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
         return np.stack([self.amplitude, self.amplitude])
@@ -93,10 +105,10 @@ def main() -> None:
     parser.add_argument("--report-only", action="store_true")
     arguments = parser.parse_args()
     if not arguments.report_only:
-        # Systems take turns, so that the table is at any time like the whole.
+        # Systems alternate, so that the finished cases are representative at any time.
         turns = itertools.product(range(arguments.cases), list[str](arguments.systems))
         for number, system in turns:
-            deal = functools.partial(dealt, number, system, "effect")
+            deal = functools.partial(from_deck, number, system, "effect")
             large = deal("factor", _FACTORS) != _FACTOR
             lonely = not family_of(deal("effect", plantable(RIGS[system])))
             if large or lonely or (system, number) in done():
@@ -112,7 +124,7 @@ def main() -> None:
 
 
 def family_of(effect: str) -> tuple[str, ...]:
-    """:return: names of effects that act much like this one; none: it has no relatives"""
+    """:return: names of effects that act similarly; empty if there are none"""
     name = effect.partition(".")[0]
     return next((family for family in _FAMILIES if name in family), ())
 
@@ -141,9 +153,9 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
 
     began = time.time()
     case, data, motion = draw(system, number, kind="effect", noise=_NOISE, most=_RECORDINGS)
-    twin, rig = believed(system, case.seen), RIGS[system]
+    twin, rig = nominal_twin(system, case.seen), RIGS[system]
     family = family_of(case.planted[0].effect)
-    if not family:  # what was dealt cannot be planted here, and something else was
+    if not family:  # the drawn effect cannot be planted here, and another one was
         return []
     asked: dict[str, Any] = {
         "effects": [effect for effect in ALL if effect.name in family],
@@ -153,7 +165,7 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
         "progress": False,
     }
     found = diagnose(twin, data, **asked)
-    common = {"system": system, "case": number, "truth": case.truths[0], "set": told(found)}
+    common = {"system": system, "case": number, "truth": case.truths[0], "set": first_set(found)}
     common |= {"verdict": found.verdict, "inside": inside_band(found, case)}
     common["seconds"] = time.time() - began
     if found.verdict != "ambiguous":
@@ -201,13 +213,13 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
 
 
 def recordings_for(designed: Any, same: set[str]) -> float:
-    """:return: designed recordings that tell the planted cause from names that mean another"""
+    """:return: number of designed recordings that separate the planted cause from wrong names"""
     own = [p.needed for p in designed.pairs if p.true in same and p.other not in same]
     return max(own, default=math.inf)
 
 
 def inside_band(found: Any, case: Any) -> float:
-    """:return: share of instants of held-out motion in the 90 % band; nan: there is no belief"""
+    """:return: share of samples of held-out motion in the 90 % band; nan: there is no belief"""
     if found.opened is None:
         return math.nan
     data, motion = recorded(dataclasses.replace(case, recordings=_HELD_OUT), _SEED + case.number)
@@ -239,8 +251,8 @@ def _simulated(base: Any) -> Any:
     return jax.jit(jax.vmap(one, (None, 0, 0)))
 
 
-def told(found: Any) -> str:
-    """:return: the first cause and what cannot be told from it"""
+def first_set(found: Any) -> str:
+    """:return: the first cause and its alternatives"""
     if not found.findings:
         return ""
     return ";".join((key(found.findings[0]), *found.findings[0].alternatives))
@@ -252,8 +264,8 @@ def values_of(answer: Any) -> dict[str, float]:
 
 
 def limits_of(system: str, motion: np.ndarray) -> dict[str, Any]:
-    """:param motion: positions and velocities that the recordings took"""
-    rig, twin = RIGS[system], believed(system)
+    """:param motion: positions and velocities of the recordings"""
+    rig, twin = RIGS[system], nominal_twin(system)
     joints, actuators = [j.name for j in twin.joints], [a.name for a in twin.actuators]
     q, v = motion[:, : rig.dof], motion[:, rig.dof :]
     middle, half = 0.5 * (q.max(0) + q.min(0)), 0.5 * np.ptp(q, 0)
@@ -277,7 +289,7 @@ def largest_share(limits: dict[str, Any], true: np.ndarray, rig: Any) -> float:
 def as_large_as_allowed(
     signal: str, excitation: Any, numbers: Any, rig: Any, rng: np.random.Generator
 ) -> np.ndarray:
-    """:return: commands of this kind, as large as the limits allow under every answer"""
+    """:return: commands of this kind, as large as the limits allow under every explanation"""
     import jax
 
     shape = unit_signal(signal, len(rig.torque), rig.dt, rng) * np.array(rig.torque)
@@ -330,7 +342,7 @@ def played(
 
 
 def report() -> None:
-    """Print and keep how often each signal settled the question, of the same cases."""
+    """Print and save how often each signal settled the question, on the same cases."""
     table: Any = pd.read_csv(_TABLE)
     one_each = table.groupby(["system", "case"]).head(1)
     print(f"{len(one_each)} cases: {one_each.verdict.value_counts().to_dict()}")
@@ -350,7 +362,7 @@ def report() -> None:
     one = played.open & (played.needed <= 1.0)
     several = played.open & played.tellable & ~one
     classes = {
-        "settled, where one designed recording should do": one,
+        "settled, where one designed recording should suffice": one,
         "settled, where several should": several,
         "settled, where the tool says none can": played.open & ~played.tellable,
     }

@@ -1,22 +1,23 @@
 """
-Open-loop gaits from scratch: return and wall time in five environments of MuJoCo.
+Open-loop gaits from scratch: return and wall time in five MuJoCo environments.
 
     python benchmarks/open_loop.py                      # 200,000 steps, five seeds
     python benchmarks/open_loop.py --steps 1000000
-    python benchmarks/open_loop.py --figure             # draw the figure again from the table
+    python benchmarks/open_loop.py --figure             # redraw the figure from the table
 
 Each run is a process of its own with the hyperparameters of ``hyperparams/openloop.yml``, which are
-for 200,000 steps, and longer rollouts where there are more steps for them; the time counts from the
-start of its interpreter. What acts at the end of the search is evaluated on 20 episodes, the same
-resets for every seed. Runs that are in the table are not done again.
+for 200,000 steps, and longer rollouts for more steps; its time counts from the start of the
+interpreter. The final gait is evaluated over 20 episodes, with the same resets for every seed.
+Finished runs are kept.
 """
 
 import argparse
 import json
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 #: environment to the median return that 200,000 steps should reach
 TARGETS = {
@@ -38,24 +39,16 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200_000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("ENV", "SEED", "STEPS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env_id, seed, steps = arguments.worker
-        print(json.dumps(worker(env_id, int(seed), int(steps))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [(e, s, arguments.steps) for s in range(arguments.seeds) for e in arguments.envs]
-        resume("open_loop", ("env", "seed", "steps"), wanted, _run, arguments.jobs)
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
+        resume("open_loop", ("env", "seed", "steps"), wanted, work, arguments.jobs)
     report()
 
 
-def _run(env_id: str, seed: int, steps: int) -> list[dict]:
-    return [fresh_process(__file__, env_id, seed, steps, cache=CACHE / "programs")]
-
-
 def worker(env_id: str, seed: int, steps: int) -> dict:
-    """Search once, then evaluate what was found."""
+    """Search once, then evaluate the gait."""
     import gymnasium
 
     from sb3_hds import OpenLoop
@@ -86,7 +79,7 @@ def _rounded(value: float | list[float]) -> float | list[float]:
 
 
 def hyperparameters(env_id: str) -> dict:
-    """:return: of the zoo's file, without what the zoo itself consumes"""
+    """:return: those of the zoo's file, without the keys of the zoo itself"""
     import yaml
 
     path = Path(__file__).parent.parent / "hyperparams" / "openloop.yml"

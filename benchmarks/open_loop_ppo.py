@@ -1,19 +1,20 @@
 """
-Open-loop gaits beside PPO, both after a million steps: the picture of the open-loop paper.
+Open-loop gaits compared with PPO after a million steps: the figure of the open-loop paper.
 
     python benchmarks/open_loop.py --steps 1000000     # the gaits
     python benchmarks/open_loop_ppo.py                 # PPO and random actions, five seeds
-    python benchmarks/open_loop_ppo.py --figure        # draw the figure again from the tables
+    python benchmarks/open_loop_ppo.py --figure        # redraw the figure from the tables
 
 PPO is SBX's, with RL Zoo's hyperparameters for these environments and its normalisation of
-observations and rewards. What acts at the end is evaluated on the same 20 resets as the gaits. In
-the picture, 0 is what random actions earn in an environment and 1 the mean of PPO's seeds; over
-environments there are interquartile means with 95 % intervals of a bootstrap that draws seeds
-within each of them, as Agarwal et al. 2021 ask for. Runs that are in the table are not done again.
+observations and rewards. Its final policy is evaluated on the same 20 resets as the gaits. In the
+figure, a score of 0 is the return of random actions in an environment and 1 the mean of PPO's
+seeds; over all environments there are interquartile means with 95 % bootstrap intervals that
+resample seeds within each environment, as recommended by Agarwal et al. 2021. Finished runs are
+kept.
 """
 
 import argparse
-import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import numpy as np
 import pandas as pd
 from intervals import of_iqm
 from open_loop import N_EPISODES, TARGETS
-from runs import CACHE, RESULTS, fresh_process, resume, save, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, save, seconds_since_start
 
 _KEYS = ("env", "learner", "seed", "steps")
 _COLOURS = {"open loop": "#27496d", "ppo": "#d1495b"}
@@ -34,12 +35,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1_000_000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=4, metavar=("ENV", "LEARNER", "SEED", "STEPS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env_id, learner, seed, steps = arguments.worker
-        print(json.dumps(worker(env_id, learner, int(seed), int(steps))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (env_id, learner, seed, steps)
@@ -47,16 +43,13 @@ def main() -> None:
             for learner, steps in (("random", 0), ("ppo", arguments.steps))
             for env_id in arguments.envs
         ]
-        resume("open_loop_ppo", _KEYS, wanted, _run, arguments.jobs)
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
+        resume("open_loop_ppo", _KEYS, wanted, work, arguments.jobs)
     report(arguments.steps)
 
 
-def _run(*run: Any) -> list[dict]:
-    return [fresh_process(__file__, *run, cache=CACHE / "programs")]
-
-
 def worker(env_id: str, learner: str, seed: int, steps: int) -> dict:
-    """Learn once, then evaluate what was learned."""
+    """Learn once, then evaluate the policy."""
     import gymnasium
 
     from sb3_hds.experiments import returns_of
@@ -78,7 +71,7 @@ class RandomActions:
 
 
 class Normalised:
-    """PPO that has learned, with the statistics of the observations that it learned from."""
+    """A trained PPO with the normalisation statistics of its observations."""
 
     def __init__(self, env_id: str, seed: int, steps: int) -> None:
         from sbx import PPO
@@ -96,7 +89,7 @@ class Normalised:
 
 
 def hyperparameters(env_id: str) -> dict[str, Any]:
-    """:return: RL Zoo's, under the version of the environment that it knows"""
+    """:return: hyperparameters of RL Zoo for the version of the environment that it has"""
     import flax.linen as nn
     import rl_zoo3
     import yaml
@@ -115,7 +108,7 @@ def hyperparameters(env_id: str) -> dict[str, Any]:
 
 
 def report(steps: int) -> None:
-    """Print and keep scores, and draw them."""
+    """Print, save and plot the scores."""
     peers = pd.read_csv(RESULTS / "open_loop_ppo.csv")
     gaits = pd.read_csv(RESULTS / "open_loop.csv")
     gaits = gaits[gaits.steps == steps].assign(learner="open loop")

@@ -1,12 +1,12 @@
-"""What simpler rules would have said of the same data: the peers of `hidden_effects.py`."""
+"""The verdicts of simpler rules on the same data: the peers of `hidden_effects.py`."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-# By how much an information criterion has to be lower, by common advice "very strong evidence".
+# Required decrease of the information criterion: "very strong evidence" by the usual scale.
 _STRONG = 10.0
-# A coefficient of the sparse regression stays if it moves this share of the force's spread.
+# Threshold of the sparse regression, as a share of the standard deviation of the force.
 _THRESHOLD = 0.1
 _N_PRUNINGS = 10
 # Hidden layer of the network, steps of its training, and their size.
@@ -24,10 +24,10 @@ class Answer(NamedTuple):
     gain: float = 0.0
 
 
-def asked(inquiry) -> dict[str, Answer]:
+def answers_of(inquiry) -> dict[str, Answer]:
     """
     :param inquiry: a `sb3_hds.sysid.diagnosis.pipeline.Inquiry` that has run
-    :return: by rule, what it says
+    :return: the answer of each rule
     """
     search, h = inquiry.search, inquiry.hypotheses
     start = search.base(h.null, h.nuisances)
@@ -51,7 +51,7 @@ def gain(search, start, kept) -> float:
 
 
 def by_bic(search, start, tried) -> Answer:
-    """The lowest Bayesian information criterion, every sample a piece of evidence."""
+    """The lowest Bayesian information criterion, with every sample counted as independent."""
     n = start.point.raw.size
     before = squares(search, start.point)
 
@@ -74,7 +74,7 @@ def by_held_out(search, start, tried) -> Answer:
 
 
 def by_parameters(search, h, start) -> Answer:
-    """Fit what the twin has; the parameter that moved most, in standard errors, is the cause."""
+    """Fit all parameters of the twin and name the one that changed most, in standard errors."""
     from sb3_hds.sysid.comparison.inference import standard_errors
 
     own = [h.indices(c)[0] for c in h.candidates if c.slot == "parameter"]
@@ -89,7 +89,7 @@ def by_parameters(search, h, start) -> Answer:
 
 
 def by_regression(inquiry, start) -> Answer:
-    """Sequentially thresholded least squares (SINDy) of the missing force."""
+    """Sequentially thresholded least squares (SINDy) on the residual force."""
     from sb3_hds.sysid.comparison.unexplained import missing_force, short_windows, weighed
 
     select = inquiry.search.select.evidence
@@ -118,7 +118,7 @@ def by_regression(inquiry, start) -> Answer:
             found.append((abs(moved[best]), list(columns)[best]))
     if not found:
         return Answer()
-    # What it names is then fitted as everything else is.
+    # The named causes are then fitted like all others.
     name, h = max(found)[1], inquiry.hypotheses
     chosen = [h.indices(c) for c in h.candidates if c.key == name]
     if not chosen:
@@ -129,7 +129,7 @@ def by_regression(inquiry, start) -> Answer:
 
 
 def _sparse(matrix: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """How far each column moves the force, in units of its spread; 0 where it was pruned."""
+    """Contribution of each column, in standard deviations of the force; 0 where it was pruned."""
     size = matrix.std(0) + 1e-300
     kept = np.ones(matrix.shape[1], bool)
     moved = np.zeros(matrix.shape[1])
@@ -147,7 +147,7 @@ def _sparse(matrix: np.ndarray, force: np.ndarray) -> np.ndarray:
 
 
 def by_network(inquiry, start) -> Answer:
-    """A network learns the missing force; something is wrong if it predicts any of the rest."""
+    """A network learns the residual force; an error is reported if it predicts held-out force."""
     import torch
 
     from sb3_hds.sysid.comparison.held_out import split

@@ -1,26 +1,24 @@
 """
-The paper's comparison on its 2D pendulum payload: second order, backpropagation through time, first
-order.
+The PODS paper's comparison on its 2D pendulum payload: second order, BPTT, first order.
 
     python benchmarks/payload.py [--seeds 5] [--epochs 40]
 
-All three have the same networks, start states, number of rollouts, discount and number of Adam
-steps per epoch, and the paper's settings otherwise: whole episodes of 100 steps, no terminal value,
-one improvement of each plan, regression with a squared error. Backpropagation takes each Adam step
-along the gradient of the mean objective through the twin and the policy, from the same start
-states.
+All three methods have the same networks, start states, number of rollouts, discount and number of
+Adam steps per epoch, and otherwise the settings of the paper: whole episodes of 100 steps, no
+terminal value, one improvement of each plan, regression with a squared error. Backpropagation
+through time (BPTT) takes each Adam step along the gradient of the mean objective through the twin
+and the policy, from the same start states.
 
 The objective is minus the cost whose inverse is the paper's reward (see the twin). Return and
-objective are measured on 500 start states that no epoch has seen. ``worsened`` counts plans kept
+objective are measured on 500 start states that no epoch has used. ``worsened`` counts plans kept
 although worse than what they started from.
 """
 
 import argparse
-import json
 import sys
 import time
 
-from runs import RESULTS, fresh_process, save
+from runs import RESULTS, arguments_of, fresh_process, save
 
 METHODS = ("first_order", "gauss_newton", "bptt")
 GOALS = ("stop", "stop_at_origin")
@@ -33,12 +31,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--epochs", type=int, default=40)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=4, metavar=("METHOD", "GOAL", "SEED", "EPOCHS"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        method, goal, seed, epochs = arguments.worker
-        print(json.dumps(worker(method, goal, int(seed), int(epochs))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         rows = []
         for goal in GOALS:
@@ -113,7 +106,7 @@ def worker(method: str, goal: str, seed: int, epochs: int) -> dict:
 
 
 def model_epoch(model):
-    """One epoch of PODS as the model does it."""
+    """One epoch of PODS."""
     from stable_baselines3.common.utils import configure_logger
 
     model.set_logger(configure_logger(0))

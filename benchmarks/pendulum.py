@@ -1,24 +1,23 @@
 """
-Pendulum-v1 from a cold start: HDS beside SB3's SAC and SBX's SAC, each in fresh processes.
+Pendulum-v1 from a cold start: HDS, SB3's SAC and SBX's SAC, each in fresh processes.
 
     python benchmarks/pendulum.py            # five seeds of HDS, one of each SAC
-    python benchmarks/pendulum.py --figure   # draw the figure again from the tables
+    python benchmarks/pendulum.py --figure   # redraw the figure from the tables
 
-Every policy is a sequence of snapshots, taken while it trains and evaluated afterwards on 500 start
-states whose best reachable return is known (SB3_HDS_DATA). Those rows are drawn afresh and exclude
-rows 0, 16, 32, ..., on which the defaults were tuned. Regret is the mean over the same states of
-best return minus return.
+Snapshots of every policy are taken during training and evaluated afterwards on 500 start states
+whose best reachable return is known (SB3_HDS_DATA). These states are drawn afresh and exclude rows
+0, 16, 32, ..., on which the defaults were tuned. Regret is the mean over these states of the best
+return minus the return.
 """
 
 import argparse
-import json
 import os
 import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from runs import RESULTS, fresh_process, save, seconds_since_start
+from runs import RESULTS, arguments_of, fresh_process, save, seconds_since_start
 
 PEERS = {"sb3_sac": 20_000, "sbx_sac": 20_000}
 TARGETS = (-150.0, -145.0, -140.0)
@@ -29,12 +28,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=2, metavar=("ALGORITHM", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        name, seed = arguments.worker
-        print(json.dumps(worker(name, int(seed))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         run(arguments.seeds)
     report()
@@ -42,7 +36,7 @@ def main() -> None:
 
 def run(n_seeds: int) -> None:
     jobs = [("hds", seed) for seed in range(n_seeds)] + [(peer, 0) for peer in PEERS]
-    held_out_states()  # says so now where the data are missing
+    held_out_states()  # raises before any run if the data are missing
     curves, finals = [], []
     for name, seed in jobs:
         print(f"{name}, seed {seed} ...", file=sys.stderr, flush=True)
@@ -145,7 +139,7 @@ def watched(model, total_timesteps: int, copy):
 
 
 def held_out_states():
-    """:return: angles [rad], speeds [rad/s], best returns of 500 states that no tuning has seen"""
+    """:return: angles [rad], speeds [rad/s] and best returns of 500 states not used in tuning"""
     folder = os.environ.get("SB3_HDS_DATA")
     if folder is None:
         raise SystemExit(

@@ -1,24 +1,23 @@
 """
-The policy gain of a diagnosis: policies from the nominal, the extended and the true twin.
+The policy gain of a diagnosis: policies from the nominal, the diagnosed and the true twin.
 
     python benchmarks/policy_gain.py                # three hidden causes, five seeds
-    python benchmarks/policy_gain.py --figure       # draw the figure again from the table
+    python benchmarks/policy_gain.py --figure       # redraw the figure from the table
 
-The real system is `sb3_hds/PendulumReal-v1` with something planted that the twin does not have, and
-sensors with noise. Each seed records ten trajectories of torques that wander, diagnoses them, and
-trains HDS in each twin without a real step, with the defaults of `measure_policy_gain`: all three
-policies act from the same 20 start states. Trainings share their seed, so what differs between
-seeds is what the data said. Each run is a process of its own; runs that are in the
-table are not done again.
+The real system is `sb3_hds/PendulumReal-v1` with a planted effect that the twin lacks, and noisy
+sensors. Each seed makes ten recordings under random torques, diagnoses them, and trains HDS in each
+twin without a real step, with the defaults of `measure_policy_gain`: all three policies act from
+the same 20 start states. All trainings share one seed, so only the data differ between seeds. Each
+run is a process of its own. Finished runs are kept.
 """
 
 import argparse
-import json
+from functools import partial
 
 import numpy as np
 import pandas as pd
 from intervals import of_iqm
-from runs import CACHE, RESULTS, fresh_process, resume, save, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, save, seconds_since_start
 
 ROBOT = "sb3_hds/PendulumReal-v1"
 NOISE = 0.01
@@ -28,7 +27,8 @@ HIDDEN = {
     "coulomb_friction": {"friction": 0.6},
     "torque_gain": {"gain": 0.6},
 }
-SIMULATIONS = ("believed", "extended", "true")
+#: twins in which policies are trained, by their names in `PolicyGain`
+SIMULATIONS = {"believed": "nominal twin", "extended": "diagnosed twin", "true": "true twin"}
 N_RECORDINGS, N_STEPS = 10, 200
 
 
@@ -38,15 +38,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=2, metavar=("HIDDEN", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        hidden, seed = arguments.worker
-        print(json.dumps({"rows": worker(hidden, int(seed))}))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [(h, seed) for seed in range(arguments.seeds) for h in arguments.hidden]
-        work = lambda *run: fresh_process(__file__, *run, cache=CACHE / "programs")["rows"]  # noqa: E731
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
         resume("policy_gain", ("hidden", "seed"), wanted, work, arguments.jobs)
     report()
 
@@ -64,14 +59,14 @@ def worker(hidden: str, seed: int) -> list[dict]:
     diagnosed = seconds_since_start()
     gain = measure_policy_gain(found, real, seeds=1, progress=False)
     keys = [key for f in found.findings for key in (f.key, *f.alternatives)]
-    told = {
+    diagnosis = {
         "verdict": found.verdict,
         "named": " ".join(f.key for f in found.findings),
         "within": any(key.startswith(f"{hidden}.") for key in keys),
         "diagnosed": diagnosed,
         "seconds": seconds_since_start(),
     }
-    return [{"twin": s, "return": gain.of(s).mean} | told for s in SIMULATIONS]
+    return [{"twin": s, "return": gain.of(s).mean} | diagnosis for s in SIMULATIONS]
 
 
 def recorded(real, seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -88,7 +83,7 @@ def recorded(real, seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def report() -> None:
-    """Print, keep and draw what the seeds say."""
+    """Print, save and plot the intervals over seeds."""
     table = pd.read_csv(RESULTS / "policy_gain.csv")
     rows = [summary(hidden, own) for hidden, own in table.groupby("hidden", sort=False)]
     print(save(rows, "policy_gain_intervals").to_string(index=False))
@@ -98,21 +93,21 @@ def report() -> None:
 def summary(hidden: str, own: pd.DataFrame) -> dict:
     """:return: interquartile means over seeds with 95 % intervals, and the gain, paired by seed"""
     by = own.pivot(index="seed", columns="twin", values="return")
-    believed, extended, true = (by[s].to_numpy() for s in SIMULATIONS)
-    told = own[own.twin == "extended"]
-    first = told.named.astype(str).str.startswith(f"{hidden}.").sum()
-    gap = of_iqm([true - believed])[0]
+    nominal, extended, true = (by[s].to_numpy() for s in SIMULATIONS)
+    diagnosed = own[own.twin == "extended"]
+    first = diagnosed.named.astype(str).str.startswith(f"{hidden}.").sum()
+    gap = of_iqm([true - nominal])[0]
     return {
         "hidden": hidden,
-        "named first": f"{first} of {len(told)}",
-        "within the set": f"{int(told.within.sum())} of {len(told)}",
-        **{s: _told(by[s].to_numpy()) for s in SIMULATIONS},
-        "gain": _told(extended - believed),
-        "share of the gap": f"{of_iqm([extended - believed])[0] / gap:.2f}" if gap > 0 else "-",
+        "named first": f"{first} of {len(diagnosed)}",
+        "within the set": f"{int(diagnosed.within.sum())} of {len(diagnosed)}",
+        **{title: _with_interval(by[s].to_numpy()) for s, title in SIMULATIONS.items()},
+        "gain": _with_interval(extended - nominal),
+        "share of the gap": f"{of_iqm([extended - nominal])[0] / gap:.2f}" if gap > 0 else "-",
     }
 
 
-def _told(values: np.ndarray) -> str:
+def _with_interval(values: np.ndarray) -> str:
     middle, low, high = of_iqm([values])
     return f"{middle:.1f} [{low:.1f}, {high:.1f}]"
 
@@ -124,10 +119,11 @@ def draw(table: pd.DataFrame) -> None:
     shown = list(dict.fromkeys(table.hidden))
     figure = Figure(figsize=(2.6 * len(shown) + 0.6, 3.0), layout="constrained")
     panels = figure.subplots(1, len(shown), squeeze=False)[0]
+    names = [title.removesuffix(" twin") for title in SIMULATIONS.values()]
     for axes, hidden in zip(panels, shown, strict=True):
         by = table[table.hidden == hidden].pivot(index="seed", columns="twin", values="return")
         for _, returns in by[list(SIMULATIONS)].iterrows():
-            axes.plot(SIMULATIONS, returns, "o-", color="#27496d", alpha=0.5, lw=1)
+            axes.plot(names, returns, "o-", color="#27496d", alpha=0.5, lw=1)
         axes.set_title(hidden.replace("_", " "), fontsize=10)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("return on the real system")

@@ -1,13 +1,14 @@
 """
-Solvers for the programmes of ``ActionShield``: time, error and violation at 2 to 12 commands.
+Solvers for the quadratic programmes of ``ActionShield``: time, error and violation.
 
     pip install daqp quadprog proxsuite piqp clarabel osqp
     python benchmarks/qp_solvers.py [--n-problems 200]
 
-Random projections ``min |u - a|^2``, ``G u <= h``, ``-1 <= u <= 1``, with twice as many constraints
-as commands, some of them active. Each problem is solved once, cold, as a step of an environment
-does it, at tolerances of 1e-8 or the solver's own. Errors are measured against the mean of the
-exact methods that are installed (daqp, quadprog). Solvers that are not installed are left out.
+The problems are random projections ``min |u - a|^2``, ``G u <= h``, ``-1 <= u <= 1`` of 2 to 12
+commands, with twice as many constraints as commands, some of them active. Each problem is solved
+once without a warm start, as a step of an environment does, at tolerances of 1e-8 or the solver's
+own. Errors are measured against the mean of the exact methods that are installed (daqp, quadprog).
+Solvers that are not installed are left out.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Rates with their intervals beside targets: what the tables of hidden effects are made of."""
+"""Rates with their intervals and targets, for the tables of `hidden_effects.py`."""
 
 import json
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ class Score(NamedTuple):
     """
     :param label: what is counted
     :param value: share or median
-    :param low: end of its 95 % Wilson interval; not a number where there is none
-    :param high: likewise
-    :param n: of how many
-    :param least: what has to be reached
-    :param most: what must not be exceeded
+    :param low: lower end of its 95 % Wilson interval; nan if there is none
+    :param high: upper end
+    :param n: number of cases
+    :param least: target: at least this value
+    :param most: target: at most this value
     """
 
     label: str
@@ -52,7 +52,7 @@ def wilson(hits: int, n: int) -> tuple[float, float]:
 
 
 def share(label: str, hits: Any, **target: float) -> Score:
-    """:param hits: of each case, whether it counts"""
+    """:param hits: for each case, whether it counts as a hit"""
     hits = np.asarray(hits, bool)
     n = len(hits)
     return Score(label, hits.mean() if n else np.nan, *wilson(int(hits.sum()), n), n, **target)
@@ -67,18 +67,21 @@ def middle(label: str, values: Any, at: float = 0.5, **target: float) -> Score:
 
 
 def sizes_of(rows: pd.DataFrame) -> tuple[list[bool], list[float]]:
-    """:return: of each parameter of a right name, whether its interval covers, and its error"""
+    """
+    :return: for each parameter of a right name, whether its interval covers the true value, and its
+        relative error
+    """
     covered, errors = [], []
     for text in rows["estimate"]:
         for value, low, high, true in json.loads(text or "{}").values():
-            # Zero is where a parameter ends: an interval that ends there, too, says little.
+            # Zero is a bound of the parameter, where an interval that ends at zero says little.
             if true:
                 covered.append(low <= true <= high)
                 errors.append(abs(value - true) / abs(true))
     return covered, errors
 
 
-def told_share(hits: Any) -> str:
+def share_with_interval(hits: Any) -> str:
     hits = np.asarray(hits, bool)
     if not len(hits):
         return "-"

@@ -2,19 +2,19 @@
 Returns under sensor noise, sensor failure and pushes: open-loop gaits and learned policies.
 
     python benchmarks/robustness.py                                 # published gaits
-    python benchmarks/robustness.py --learners sac --steps 200000   # and what is learned there
+    python benchmarks/robustness.py --learners sac --steps 200000   # and a learner
 
-The gaits are those that the authors of the open-loop paper published. Twice: with encoders of their
-own, as on a robot, and with the loop that tracks joints looking at the observation. Learners are
-ids of this package, or SBX's ``sac`` and ``ppo``. Each policy runs the same starts under each
-perturbation. Runs that are in the table are not done again.
+The gaits are those that the authors of the open-loop paper published, in two variants: with
+encoders of their own, as on a robot, and with joint controllers that use the observation. Learners
+are ids of this package, or SBX's ``sac`` and ``ppo``. Each policy runs from the same starts under
+each perturbation. Finished runs are kept.
 """
 
 import argparse
-import json
+from functools import partial
 
 import numpy as np
-from runs import CACHE, RESULTS, fresh_process, resume
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume
 
 TAU = 2.0 * np.pi
 #: the constants that the paper's authors published, in rad and rad/s
@@ -37,7 +37,7 @@ GAITS = {
         "kd": 0.05,
     },
 }
-#: how the joints of a gait are known
+#: source of the joint states that a gait tracks
 ENCODERS = {"gait": "own", "gait, joints observed": "observation"}
 _SEED = 0
 
@@ -49,19 +49,14 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200_000, help="that a learner has")
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--worker", nargs=3, metavar=("ENV", "POLICY", "EPISODES"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        env_id, policy, episodes = arguments.worker
-        print(json.dumps({"rows": worker(env_id, policy, int(episodes))}))
-        return
+    arguments = arguments_of(parser, worker)
     learned = [f"{name}, {arguments.steps:,} steps" for name in arguments.learners]
     wanted = [
         (env_id, policy, arguments.episodes)
         for policy in (*ENCODERS, *learned)
         for env_id in arguments.envs
     ]
-    work = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+    work = partial(fresh_process, __file__, cache=CACHE)
     resume("robustness", ["env", "policy", "episodes"], wanted, work, arguments.jobs)
     report()
 

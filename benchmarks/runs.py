@@ -1,7 +1,9 @@
-"""Fresh processes, and runs and tables that survive an interruption."""
+"""Fresh processes, and tables of runs that survive an interruption."""
 
+import argparse
 import fcntl
 import hashlib
+import inspect
 import json
 import os
 import shutil
@@ -19,29 +21,49 @@ from typing import Any
 import pandas as pd
 
 RESULTS = Path(__file__).parent / "results"
-#: what may be thrown away: compiled programs, and models that several runs start from
+#: may be deleted: compiled programs, and models that several runs start from
 CACHE = Path(__file__).parent / ".cache"
 
 
-def fresh_process(script: str, *arguments: Any, cache: Path | None = None) -> dict[str, Any]:
+def arguments_of(parser: argparse.ArgumentParser, worker: Callable[..., Any]) -> argparse.Namespace:
     """
-    Run a benchmark's worker in a process of its own.
+    Parse the command line of a benchmark, or act as the worker that `fresh_process` started.
 
-    The worker finds the moment of its start [s since the epoch] in ``BENCHMARK_START`` and prints
-    one line of JSON last.
+    :param worker: called with the values of ``--worker``, each converted to the type of its
+        parameter; its result is printed as one line of JSON
+    """
+    parameters = inspect.signature(worker).parameters
+    names = tuple(name.upper() for name in parameters)
+    parser.add_argument("--worker", nargs=len(names), metavar=names, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if not arguments.worker:
+        return arguments
+    types = [parameter.annotation for parameter in parameters.values()]
+    values = [of(value) for of, value in zip(types, arguments.worker, strict=True)]
+    print(json.dumps(worker(*values)))
+    raise SystemExit
 
-    :param cache: where compiled programs are kept; None: nowhere, the worker compiles everything
-    :raises RuntimeError: with the worker's last lines, if it failed
+
+def fresh_process(script: str, *arguments: Any, cache: Path | None = None) -> Any:
+    """
+    Run a benchmark's worker (`arguments_of`) in a process of its own.
+
+    The environment variable ``BENCHMARK_START`` holds the time at which it was started [s since the
+    epoch].
+
+    :param cache: folder of compiled programs; None: the worker compiles everything
+    :return: what the worker returned
+    :raises RuntimeError: with the last lines of the worker's output, if it failed
     """
     folder = nullcontext(cache) if cache else tempfile.TemporaryDirectory()
     with folder as kept:
-        surroundings = os.environ | {
+        environment = os.environ | {
             "SB3_HDS_CACHE": str(kept),
             "JAX_COMPILATION_CACHE_DIR": str(kept) if cache else "",
             "BENCHMARK_START": repr(time.time()),
         }
         command = [sys.executable, script, "--worker", *map(str, arguments)]
-        done = subprocess.run(command, env=surroundings, capture_output=True, text=True)
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-3000:]}")
     return json.loads(done.stdout.strip().splitlines()[-1])
@@ -49,7 +71,7 @@ def fresh_process(script: str, *arguments: Any, cache: Path | None = None) -> di
 
 @contextmanager
 def others_waiting() -> Iterator[None]:
-    """Of workers that run at a time, one measures; the others import and compile meanwhile."""
+    """Of workers running in parallel, let one measure while the others import and compile."""
     CACHE.mkdir(exist_ok=True)
     with open(CACHE / "measuring.lock", "w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
@@ -57,7 +79,7 @@ def others_waiting() -> Iterator[None]:
 
 
 def code_version(*roots: Path) -> str:
-    """:return: of all Python sources under these folders: what code that is not changed keeps"""
+    """:return: hash of all Python sources in these folders; unchanged code has the same hash"""
     found = hashlib.sha256()
     for root in roots:
         for path in sorted(root.rglob("*.py")):
@@ -72,7 +94,7 @@ def seconds_since_start() -> float:
 
 
 def save(rows: Sequence[dict[str, Any]], name: str) -> pd.DataFrame:
-    """Write ``results/NAME.csv``, by a temporary name; rows of other runs with the same keys go."""
+    """Write ``results/NAME.csv`` by a temporary name. It then holds these rows and no others."""
     RESULTS.mkdir(exist_ok=True)
     table, path = pd.DataFrame(rows), RESULTS / f"{name}.csv"
     temporary = path.with_suffix(".tmp")
@@ -83,21 +105,21 @@ def save(rows: Sequence[dict[str, Any]], name: str) -> pd.DataFrame:
 
 class InterruptedRun:
     """
-    What the training of a model of SB3 leaves at each mark, until it is through.
+    Checkpoints of the training of an SB3 model, one at each mark, until it is complete.
 
-    :param folder: of this run alone
+    :param folder: used by this run only
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def rows(self) -> list[dict[str, Any]]:
-        """:return: of the marks that it came to; empty: of none"""
+        """:return: one for each mark that was reached"""
         path = self.folder / "rows.json"
         return json.loads(path.read_text()) if path.exists() else []
 
     def model(self, algorithm: type, env: str) -> Any:
-        """:return: as it was at its last mark"""
+        """:return: the model at its last mark"""
         import gymnasium
 
         at = self._at(self.rows())
@@ -126,26 +148,26 @@ def resume(
     name: str,
     keys: Sequence[str],
     wanted: Iterable[tuple[Any, ...]],
-    work: Callable[..., list[dict[str, Any]]],
+    work: Callable[..., dict[str, Any] | list[dict[str, Any]]],
     jobs: int,
-    through: Callable[[tuple[Any, ...], list[dict[str, Any]]], bool] = lambda run, rows: True,
+    complete: Callable[[tuple[Any, ...], list[dict[str, Any]]], bool] = lambda run, rows: True,
 ) -> None:
     """
-    Add to ``results/NAME.csv`` what is not in it yet. A run that fails is reported and left out.
+    Make the runs that ``results/NAME.csv`` lacks. A run that fails is reported and left out.
 
-    :param keys: columns that tell runs apart
-    :param wanted: their values, run by run
-    :param work: from these values to the run's rows
-    :param jobs: how many runs at a time
-    :param through: of a run and its rows that are there, whether it is at its end; what one that is
-        not comes to takes the place of its rows
+    :param keys: columns that identify a run
+    :param wanted: values of these columns, for each run
+    :param work: takes these values and returns the row or the rows of the run
+    :param jobs: number of parallel runs
+    :param complete: takes a run and its rows in the table, and says whether the run is complete; an
+        incomplete run is made again, and replaces its rows
     """
     path = RESULTS / f"{name}.csv"
     rows = pd.read_csv(path).to_dict("records") if path.exists() else []
     before: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in rows:
         before.setdefault(tuple(row[key] for key in keys), []).append(row)
-    done, lock = {run for run, its in before.items() if through(run, its)}, Lock()
+    done, lock = {run for run, its in before.items() if complete(run, its)}, Lock()
 
     def one(run: tuple[Any, ...]) -> None:
         label = ", ".join(map(str, run))
@@ -156,6 +178,7 @@ def resume(
             return
         with lock:
             rows[:] = [row for row in rows if tuple(row[key] for key in keys) != run]
+            found = [found] if isinstance(found, dict) else found
             rows.extend(dict(zip(keys, run, strict=True)) | row for row in found)
             save(rows, name)
         print(f"{time.strftime('%H:%M:%S')} {label}", file=sys.stderr, flush=True)

@@ -1,20 +1,19 @@
 """
-When two names mean the same cause: what the catalogue declares, where it acts, and whether the
-condition that it declares holds in the recordings at hand.
+Which names are equivalent: what the catalogue declares, checked at this place in these recordings.
 
-Effects declare what they cannot be told from, *and when*: a constant force is a Coulomb friction
-only while the joint moves in one direction. Elsewhere the one is a wrong name for the other. Both
-have to be at one place; an actuator is at the joint that it drives.
+Effects declare from which other effects they cannot be distinguished, *and when*: a constant force
+is equivalent to Coulomb friction only while the joint moves in one direction. Otherwise the name is
+wrong. Both must be at one place; an actuator is at the joint that it drives.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from hidden_cases import RIGS, Case, believed, places_of, slot_of, spread
+from hidden_cases import RIGS, Case, nominal_twin, places_of, slot_of, spread
 from independent_rigs import EVERYWHERE
 
-# Share of the samples that have to agree where something is said of all.
+# Share of the samples for which a condition on "all" samples must hold.
 _ALL = 0.99
 # "Several times" faster, and the share of samples of which that has to be true.
 _SEVERAL, _MOSTLY = 3.0, 0.95
@@ -36,7 +35,7 @@ class Motion(NamedTuple):
     :param v: velocities
     :param u: commands of its motor, zero without one
     :param dt: interval between commands [s]
-    :param wide: what its positions usually spread over
+    :param wide: typical standard deviation of its positions
     """
 
     index: int
@@ -151,10 +150,10 @@ def equals(
     :param commands: shape ``(n, actuators)``
     :param named: all names that a diagnosis gave one after the other, each with its place
     :param values: their parameters, by name
-    :return: of each cause that was planted, the other names that mean the same here
+    :return: for each planted cause, the other names that are equivalent in these data
     """
     found: dict[str, list[str]] = {}
-    # What is outside the catalogue has no name there.
+    # Effects outside the catalogue have no name in it.
     for truth, planted in zip(case.truths, case.planted, strict=False):
         same, joint = [], planted.index % RIGS[case.system].dof
         here = _motion_of(planted.index, case, motion, commands)
@@ -189,7 +188,7 @@ def _together(effect: str, joint: int, case: Case, named: Sequence[str]) -> list
 
 def _named_at(effect: str, joint: int, system: str) -> str:
     """:return: the effect with its place at or before a joint; empty if there is none"""
-    twin = believed(system)
+    twin = nominal_twin(system)
     if effect.startswith("parameter."):
         return effect if effect.partition(".")[2] in twin.parameters else ""
     if slot_of(effect) == "channel" or joint >= len(places_of(effect, system)):
@@ -211,7 +210,7 @@ def right(truths: str, same: Mapping[str, Sequence[str]], names: str) -> bool:
     :param truths: what was planted, separated by semicolons
     :param same: as ``equals`` says
     :param names: likewise
-    :return: whether one of the names is one of the causes
+    :return: whether one of the names is one of the causes, or equivalent to one
     """
     meant = {truth: {truth, *same.get(truth, ())} for truth in truths.split(";") if truth}
     return any(name in every for name in names.split(";") for every in meant.values())

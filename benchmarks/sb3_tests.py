@@ -1,13 +1,13 @@
 """
-Run the test files of Stable-Baselines3 and SB3-Contrib on our classes, in the place of theirs.
+The test files of Stable-Baselines3 and SB3-Contrib, run on our classes in place of theirs.
 
     pip download --no-binary :all: --no-deps stable-baselines3==2.9.2 sb3-contrib==2.9.2
     tar xzf stable_baselines3-2.9.2.tar.gz && tar xzf sb3_contrib-2.9.2.tar.gz
     python benchmarks/sb3_tests.py stable_baselines3-2.9.2 sb3_contrib-2.9.2
 
-Nothing in those files is changed: this file is also a plugin of pytest, which binds the name that
-they import (``SAC``) to our class before they are read, and picks the cases that use it. Classes
-that are in the table already are not run again.
+The files are unchanged: this script is also a pytest plugin, which binds the name that they import
+(``SAC``) to our class before they are read, and selects the cases that use it. Classes that are
+already in the table are not run again.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 import pandas as pd
 from runs import CACHE, RESULTS, resume
 
-#: of each row of the table: the class that is replaced, and ours
+#: for each row of the table, the class that is replaced, and ours
 REPLACED = {
     "GSDESAC": ("stable_baselines3.SAC", "GSDESAC"),
     "DroQ": ("stable_baselines3.SAC", "DroQ"),
@@ -41,7 +41,7 @@ _IGNORED = "tests/test_utils.py"
 #: of a class, cases that are not run: networks of 134 million weights, held twice with everything
 #: that TD7 learns by, do not fit into 24 GiB
 _TOO_LARGE = {"TD7": ["tests/test_save_load.py::test_save_load_large_model"]}
-#: why a case fails, by what its message says
+#: reason of a failure, by words in its message
 REASONS = {
     "images": "image",
     "torch objects": "features_extractor_class|log_ent_coef|state_dict",
@@ -142,7 +142,7 @@ def table(cases: pd.DataFrame) -> pd.DataFrame:
 
 
 def pytest_configure(config: Any) -> None:
-    """Put our class where the tests import theirs from."""
+    """Replace the class that the tests import by ours."""
     if _ROW in os.environ:
         stock, ours = REPLACED[os.environ[_ROW]]
         package, _, name = stock.partition(".")
@@ -152,7 +152,7 @@ def pytest_configure(config: Any) -> None:
 
 
 def pytest_collection_modifyitems(config: Any, items: list[Any]) -> None:
-    """Leave out what does not use the replaced class."""
+    """Deselect cases that do not use the replaced class."""
     if _ROW in os.environ:
         name, ours = config.stash_of_sb3_tests
         items[:] = [item for item in items if uses(item, name, ours)]

@@ -1,11 +1,11 @@
 """
-Cases of `hidden_effects.py` with two to nine causes at once, as real machines have them.
+Cases of `hidden_effects.py` with two to nine causes at once, as on real machines.
 
-Friction at the joints comes first, in half of the cases the scale is wrong besides (an inertia, or
-the gain of a motor), and then whatever else a machine has. Sizes lie between twice what would just
-show and *dominant*: friction that carries nine tenths of the torque. Commands are torques as they
-come, or those of a position or velocity loop; recordings are many, or a single long one; some are
-of positions only. All that is dealt, as everything about other cases is.
+Most cases have friction at the joints; in half of them the scale is wrong as well (an inertia, or
+the gain of a motor); further causes are drawn from the rest of the catalogue. Sizes lie between
+twice the detection limit and *dominant*: friction that takes nine tenths of the torque. Commands
+are open-loop torques, or those of a position or velocity loop; there are many recordings or a
+single long one; some have positions only. All of these are drawn from decks, as in other cases.
 """
 
 import dataclasses
@@ -26,9 +26,9 @@ from hidden_cases import (
     RIGS,
     Case,
     base_value,
-    believed,
-    dealt,
+    from_deck,
     kind_of,
+    nominal_twin,
     nothing,
     places_of,
     recorded,
@@ -51,7 +51,7 @@ SEEN = ("qv", "qv", "q", "qv")
 LONG = (False, True, False, False)
 _NOISES = ("tick", "tick", "1 %", "1 %", "5 %")
 _RECORDINGS = (6, 8, 10, 14, 20)
-# Causes that a rig of so many joints may have; more than two joints: nine.
+# Largest number of causes by number of joints; more than two joints: nine.
 _FEWEST, _MOST = 2, {1: 5, 2: 7}
 _MOST_OF_ALL = 9
 # Of the causes beside the scale, the share that is viscous or Coulomb friction.
@@ -72,7 +72,7 @@ _OTHERS = {
     "sensor_bias": "offset",
 }
 _FAMILIES = {**_OTHERS, _VISCOUS: "viscous", _DRY: "dry"}
-# Sizes begin at so many times what would just show.
+# Smallest size in detection limits.
 _LEAST = 2.0
 # Where friction carries this share of the torque, it is dominant: by so much it is larger then than
 # what moves the rig otherwise. Joints without a motor, or with a servo whose gains are what they
@@ -94,7 +94,7 @@ class Usual(NamedTuple):
     """
     What a rig does where nothing is planted.
 
-    :param limits: sizes that would just show, by name with place and by parameter
+    :param limits: detection limits, by name with place and by parameter
     :param force: typical force of each joint [N m] or [N]
     :param inertia: of each joint, the others held
     :param speed: root mean square velocity of each joint
@@ -121,7 +121,7 @@ def draw(
     """
     kind, turn = kind_of(system, number)
     turn = turn if kind == SEVERAL else number
-    deal = functools.partial(dealt, turn, system, SEVERAL)
+    deal = functools.partial(from_deck, turn, system, SEVERAL)
     driven = "servos" not in system
     recordings = min(deal("recordings", _RECORDINGS), most)
     long = deal("long", LONG)
@@ -144,7 +144,7 @@ def draw(
     scale = deal("scale", (True, False))
     capacity = _MOST.get(RIGS[system].dof, _MOST_OF_ALL)
     count = deal("count", range(_FEWEST, capacity + 1))
-    # Where nothing could show in so much noise, there is less.
+    # The noise is reduced where no effect would be detectable.
     levels = sorted(NOISES, key=NOISES.__getitem__)
     for level in reversed(levels[: levels.index(case.noise) + 1]):
         found = _drawn(dataclasses.replace(case, noise=level), scale, count, capacity)
@@ -181,7 +181,7 @@ def _drawn(
 
 
 def _with(case: Case, planted: tuple[Planted, ...]) -> Case | None:
-    """:return: the case with its causes; None if no body has such an inertia"""
+    """:return: the case with its causes; None if the inertia is physically impossible"""
     rig = RIGS[case.system]
     if rig.base is None:
         return dataclasses.replace(case, planted=planted)
@@ -195,7 +195,7 @@ def _with(case: Case, planted: tuple[Planted, ...]) -> Case | None:
 def _planted(
     case: Case, count: int, scale: bool, rng: np.random.Generator
 ) -> tuple[Planted, ...] | None:
-    """:return: as many causes; None if no more of them could be large enough to show"""
+    """:return: so many causes; None if fewer can be large enough to be detectable"""
     found = [_size(case, *_scale(case, rng), rng)] if scale else []
     if not all(map(_finite, found)):
         return None
@@ -207,7 +207,7 @@ def _planted(
             return None
         chosen = friction if (rng.random() < _FRICTION and friction) or not others else others
         if chosen is others:
-            # Kinds come up alike, however many places they have.
+            # Kinds are equally likely, independently of their number of places.
             kind = str(rng.choice(sorted({kind for kind, _ in others})))
             chosen = [place for place in others if place[0] == kind]
         kind, index = chosen[int(rng.integers(len(chosen)))]
@@ -225,7 +225,7 @@ def _finite(planted: Planted) -> bool:
 
 
 def _scale(case: Case, rng: np.random.Generator) -> tuple[str, int]:
-    """A wrong inertia, or the gain of a motor, which set points have none of."""
+    """A wrong inertia, or the gain of a motor; commands that are set points have no gain."""
     joints, motors = RIGS[case.system].dof, len(RIGS[case.system].torque)
     if "servos" in case.system or rng.random() < 0.5:
         return PARAMETER, int(rng.integers(joints))
@@ -233,7 +233,7 @@ def _scale(case: Case, rng: np.random.Generator) -> tuple[str, int]:
 
 
 def _places(case: Case) -> list[tuple[str, int]]:
-    """:return: effects and where they may be, of a late bus at all motors at once"""
+    """:return: effects and their possible places; a late bus acts on all motors at once"""
     rig, servo = RIGS[case.system], "servos" in case.system
     motors = len(rig.torque)
     found = []
@@ -251,7 +251,7 @@ def _places(case: Case) -> list[tuple[str, int]]:
 
 
 def _size(case: Case, kind: str, index: int, rng: np.random.Generator) -> Planted:
-    """An effect with a size between what shows and what dominates; NaN if there is none."""
+    """An effect with a size between detectable and dominant; NaN if there is no such size."""
     usual = usual_of(case)
     side = float(rng.choice((-1.0, 1.0)))
     if kind == PARAMETER:
@@ -303,15 +303,15 @@ def _parameter(case: Case, joint: int, side: float, rng: np.random.Generator) ->
     if rig.base is not None:
         name, index, most = rig.base[0], 0, _OFF * base_value(case.system)
     else:
-        name, index = f"{believed(case.system).joints[joint].name}{ARMATURE}", joint
-        own = believed(case.system).values[name]
+        name, index = f"{nominal_twin(case.system).joints[joint].name}{ARMATURE}", joint
+        own = nominal_twin(case.system).values[name]
         most = _OFF * (own if side < 0.0 else max(own, usual.inertia[joint]))
     limit = usual.limits.get(f"parameter.{name}", {}).get(name, np.nan)
     return Planted(f"parameter.{name}", index, {name: side * _between(limit, most, rng)})
 
 
 def _between(limit: float, most: float, rng: np.random.Generator) -> float:
-    """Uniform in the logarithm; NaN where even the largest would hardly show."""
+    """Draw log-uniformly; NaN if even the largest value is hardly detectable."""
     low = _LEAST * (limit or np.nan)
     if not low < most:
         return np.nan
@@ -418,7 +418,7 @@ def usual_of(case: Case) -> Usual:
 
 @functools.cache
 def _usual(system: str, noise: str, seen: str, loop: str) -> Usual:
-    """By the equation of motion of a recording without a cause; kept from call to call."""
+    """Measured from the equation of motion of a recording without causes; cached."""
     path = CACHE / "usual" / f"{system}_{noise.replace(' ', '')}_{seen}_{loop}.json"
     if not path.exists():
         write(path, json.dumps(_measured(system, noise, seen, loop)))
@@ -433,7 +433,7 @@ def _measured(system: str, noise: str, seen: str, loop: str) -> dict[str, Any]:
 
     case = dataclasses.replace(nothing(system, noise), kind=SEVERAL, seen=seen, loop=loop)
     data, moved = _driven(case, 99)
-    twin = believed(system, seen)
+    twin = nominal_twin(system, seen)
     found = screen(twin, motion(twin, data), effects.ALL, ())
     if found is None:
         raise RuntimeError(f"{system}: there is no equation of motion, so no size just shows.")

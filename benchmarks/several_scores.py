@@ -1,4 +1,4 @@
-"""What came out of the cases with several causes at once: rates beside the targets, tables."""
+"""The scores of cases with several causes at once: rates and their targets, tables."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -6,22 +6,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from rates import Score, as_table, middle, share, sizes_of, told_share
+from rates import Score, as_table, middle, share, share_with_interval, sizes_of
 
 SEVERAL = "several"
 RULE = "several: "
-# What a verdict may take by number of joints [s], programs compiled or not.
+# Target for the time of a verdict by number of joints [s], with any cache.
 _SECONDS = {1: 10.0, 2: None, 3: None, 6: 60.0}
 
 
-class Judged(NamedTuple):
+class CaseScore(NamedTuple):
     """
-    What was said of one case.
+    The score of one case.
 
-    :param named: of each planted cause that shows, whether one of the names means it
-    :param within: the same of names and what is said to be as likely
-    :param right: of each name that was given, whether it means something that was planted
-    :param among: of each, whether that or what is said to be as likely does
+    :param named: for each detectable planted cause, whether it was named
+    :param within: for each of them, whether it was named or in the set of a finding
+    :param right: for each finding, whether its name is a planted cause
+    :param among: for each finding, whether its name or an alternative in its set is a planted cause
     """
 
     named: list[bool]
@@ -39,23 +39,23 @@ class Judged(NamedTuple):
         return all(self.among) and all(self.within)
 
 
-def judged(
+def score_case(
     truths: Sequence[str],
     visible: Sequence[bool],
     same: Mapping[str, Sequence[str]],
     sets: Sequence[Sequence[str]],
-) -> Judged:
+) -> CaseScore:
     """
     :param truths: names of all planted causes, with their places
     :param visible: whether each is above twice the detection limit
-    :param same: other names that mean the same in these data, by truth
-    :param sets: of each finding, its name and what is as likely
+    :param same: equivalent names in these data, by planted cause
+    :param sets: for each finding, its name and its alternatives
     """
     meant = [{truth, *same.get(truth, ())} for truth in truths]
     shown = [own for own, visible_ in zip(meant, visible, strict=True) if visible_]
     names, every = {s[0] for s in sets}, {name for s in sets for name in s}
     right = lambda names: any(own & {*names} for own in meant)  # noqa: E731
-    return Judged(
+    return CaseScore(
         named=[bool(own & names) for own in shown],
         within=[bool(own & every) for own in shown],
         right=[right(s[:1]) for s in sets],
@@ -63,9 +63,9 @@ def judged(
     )
 
 
-def of_diagnose(rows: pd.DataFrame) -> list[Judged]:
+def of_diagnose(rows: pd.DataFrame) -> list[CaseScore]:
     return [
-        judged(
+        score_case(
             row["truth"].split(";"),
             json.loads(row["visible"]),
             json.loads(row["same"]),
@@ -75,17 +75,17 @@ def of_diagnose(rows: pd.DataFrame) -> list[Judged]:
     ]
 
 
-def of_rule(rows: pd.DataFrame, rule: str) -> list[Judged]:
+def of_rule(rows: pd.DataFrame, rule: str) -> list[CaseScore]:
     found = []
     for _, row in rows.iterrows():
         said = json.loads(row[f"{RULE}{rule}"])
         sets = [[name] for name in said["names"]]
         visible = json.loads(row["visible"])
-        found.append(judged(row["truth"].split(";"), visible, said["same"], sets))
+        found.append(score_case(row["truth"].split(";"), visible, said["same"], sets))
     return found
 
 
-def _every(found: Sequence[Judged], field: str) -> list[bool]:
+def _every(found: Sequence[CaseScore], field: str) -> list[bool]:
     return [hit for one in found for hit in getattr(one, field)]
 
 
@@ -95,14 +95,14 @@ def scores(rows: pd.DataFrame) -> list[Score]:
     covered, errors = sizes_of(rows)
     visible = [shown for text in rows["visible"] for shown in json.loads(text)]
     return [
-        share("planted causes that show: named or in a set", _every(found, "within"), least=0.95),
-        share("planted causes that show: named", _every(found, "named")),
+        share("detectable planted causes: named or in a set", _every(found, "within"), least=0.95),
+        share("detectable planted causes: named", _every(found, "named")),
         share("names that are right", _every(found, "right"), least=0.97),
         share("cases: all right, none missing", [one.flawless for one in found], least=0.85),
         share("the same, sets included", [one.flawless_with_sets for one in found]),
-        share("90 % intervals that cover", covered, least=0.85, most=0.95),
+        share("90 % intervals that cover the truth", covered, least=0.85, most=0.95),
         middle("error of a parameter, median", errors),
-        share("planted causes that show, of all", visible),
+        share("planted causes that are detectable", visible),
         *(
             middle(
                 f"seconds, {joints} joint{'s' if joints > 1 else ''}, median",
@@ -142,7 +142,7 @@ def by_condition(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def by_rule(rows: pd.DataFrame) -> pd.DataFrame:
-    """Others, and `diagnose` on the cases that each of them was asked about."""
+    """Compare each other method with `diagnose` on the cases that it was applied to."""
     found = []
     for rule in (name.removeprefix(RULE) for name in rows if name.startswith(RULE)):
         own = rows[rows[f"{RULE}{rule}"] != ""]
@@ -152,14 +152,14 @@ def by_rule(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(found)
 
 
-def _row(found: Sequence[Judged], rows: pd.DataFrame, seconds: pd.Series) -> dict[str, Any]:
+def _row(found: Sequence[CaseScore], rows: pd.DataFrame, seconds: pd.Series) -> dict[str, Any]:
     names = sum(len(one.right) for one in found)
     return {
         "cases": len(rows),
-        "causes named or in a set": told_share(_every(found, "within")),
-        "names right": told_share(_every(found, "right")),
-        "names a case": f"{names / len(rows):.1f}" if len(rows) else "-",
-        "all right, none missing": told_share([one.flawless for one in found]),
+        "causes named or in a set": share_with_interval(_every(found, "within")),
+        "names right": share_with_interval(_every(found, "right")),
+        "names per case": f"{names / len(rows):.1f}" if len(rows) else "-",
+        "all right, none missing": share_with_interval([one.flawless for one in found]),
         "seconds": f"{np.median(seconds):.1f}" if len(rows) else "-",
     }
 

@@ -3,25 +3,25 @@ The gap between simulation and reality, and how much of it each method closes pe
 
     python benchmarks/sim_to_real.py                       # all cells and methods, five seeds
     python benchmarks/sim_to_real.py --cells heavy --seeds 2 --jobs 1
-    python benchmarks/sim_to_real.py --figure              # draw the figure again from the table
+    python benchmarks/sim_to_real.py --figure              # redraw the figure from the table
 
 Each cell is a stand-in for hardware that its data sheet describes wrongly. Wrong twin, HDS and
-domain randomisation know the data sheet; the ceiling is PODS on the true twin. Every policy is
-evaluated on the same 50 start states of the real system. Finished runs are kept in the table: an
-interrupted benchmark goes on where it stopped. Only cells whose gap (ceiling minus wrong twin) is
-above three standard errors count; a twin that is wrong in nothing but its steps is a case of its
-own, beside the medians. Medians over cells come with 90 % intervals of a bootstrap that
-draws seeds within each cell, as Agarwal et al. 2021 ask for (rliable's stratified bootstrap, with
-the wrong twin and the ceiling of a seed drawn together with it).
+domain randomisation know the data sheet; the ceiling is PODS in the true twin. Every policy is
+evaluated on the same 50 start states of the real system. Finished runs are kept, so an interrupted
+benchmark resumes. Only cells whose gap (ceiling minus wrong twin) exceeds three standard errors
+count; a twin that is wrong only in its steps is reported apart from the medians. Medians over cells
+have 90 % bootstrap intervals that resample seeds within each cell, as recommended by Agarwal et al.
+2021 (rliable's stratified bootstrap, in which a seed's wrong twin and ceiling are drawn together
+with it).
 """
 
 import argparse
-import json
+from functools import partial
 
 import numpy as np
 import pandas as pd
 from hardware import CELLS, OTHER_TWIN, length_of, make, pretrained, return_of
-from runs import CACHE, RESULTS, fresh_process, resume, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, seconds_since_start
 
 METHODS = ("ceiling", "wrong_twin", "randomised", "hds", "sac", "tqc", "droq")
 _DEEPEST = 1800.0  # below the best return, in the figure
@@ -37,12 +37,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="*", default=list(METHODS))
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--figure", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("CELL", "METHOD", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        cell, method, seed = arguments.worker
-        print(json.dumps(worker(cell, method, int(seed))))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.figure:
         wanted = [
             (cell, method, seed)
@@ -50,25 +45,25 @@ def main() -> None:
             for cell in arguments.cells
             for method in arguments.methods
         ]
-        in_process = lambda *run: fresh_process(__file__, *run, cache=CACHE)["rows"]  # noqa: E731
+        in_process = partial(fresh_process, __file__, cache=CACHE)
         resume("sim_to_real", ("cell", "method", "seed"), wanted, in_process, arguments.jobs)
     report()
 
 
-def worker(cell: str, method: str, seed: int) -> dict:
+def worker(cell: str, method: str, seed: int) -> list[dict]:
     """Train once; evaluate after each number of real episodes."""
     if method in ("ceiling", "wrong_twin", "randomised"):
-        return {"rows": [evaluated(planner(method, cell, seed), cell, 0)]}
+        return [evaluated(planner(method, cell, seed), cell, 0)]
     model, rows = learner(method, cell, seed), []
     for episodes in STEPS:
         missing = episodes * length_of(cell) - model.num_timesteps
         model.learn(missing, reset_num_timesteps=False)
         rows.append(evaluated(model, cell, episodes))
-    return {"rows": rows}
+    return rows
 
 
 def planner(method: str, cell: str, seed: int):
-    """HDS that never sees data is PODS with the same planning settings as HDS beside it."""
+    """HDS without data is PODS with the planning settings of HDS."""
     from sb3_hds import HDS, envs
 
     if method == "ceiling":
@@ -144,7 +139,7 @@ def by_cell(table: pd.DataFrame, shown: pd.DataFrame) -> pd.DataFrame:
 
 
 def ahead(group: pd.DataFrame) -> float:
-    """Of every learner and number of steps, the least difference, over the seeds that both have."""
+    """The least lead of HDS over all learners and numbers of steps, over common seeds."""
     returns = group.pivot_table("return", ["seed", "episodes"], "method")
     others = [name for name in ("sac", "tqc", "droq") if name in returns]
     if "hds" not in returns or not others:
@@ -154,7 +149,7 @@ def ahead(group: pd.DataFrame) -> float:
 
 
 def seed_by_seed(table: pd.DataFrame) -> pd.DataFrame:
-    """How often HDS is behind a learner with the same seed after as many real steps, if ever."""
+    """How often HDS is behind a learner with the same seed after the same number of real steps."""
     returns = table.pivot_table("return", ["cell", "seed", "episodes"], "method")
     rows = []
     for method in ("sac", "tqc", "droq"):
@@ -230,7 +225,7 @@ def closed(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def learned_in(shown: pd.DataFrame) -> list[str]:
-    """:return: cells in which somebody has learned, in their order"""
+    """:return: cells in which a learner was run, in order"""
     return list(dict.fromkeys(shown[shown["episodes"] > 0]["cell"]))
 
 
@@ -257,7 +252,7 @@ def figure(shown: pd.DataFrame) -> None:
         for method, colour in styles.items():
             rows = group[group["method"] == method]
             panel.plot(rows["episodes"], rows["return"], "o-", color=colour, label=method)
-        # Where a learner first spins, the rest would be a line.
+        # The returns of a learner that first spins would compress the rest to a line.
         worst, best = group["return"].min(), group["return"].max()
         deepest = max(worst, best - _DEEPEST)
         panel.set_ylim(deepest - 0.05 * (best - deepest), best + 0.1 * (best - deepest))

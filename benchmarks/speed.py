@@ -1,37 +1,45 @@
 """
-Steps and updates per second of the model-free family, beside SBX, SB3 and SB3-contrib.
+Steps and updates per second of the model-free algorithms, compared with SBX, SB3 and SB3-Contrib.
 
     python benchmarks/speed.py                     # all rows; resumable
     python benchmarks/speed.py --rows "droq, 20" "droq, 1, start-up"
     python benchmarks/speed.py --table
     python benchmarks/speed.py --on cuda --jobs 4  # rows of a GPU, in a table of their own
 
-Pendulum-v1, equal networks, batches and replay ratios. The two that are compared learn by turns in
-one process, in short blocks, so that a slow moment of the machine meets both; the ratio is the
-median over pairs of neighbouring blocks, with its first and third quartile. The start-up is that of
-a fresh process each, from the interpreter to the first update, with no compiled program kept.
+Pendulum-v1 with equal networks, batches and replay ratios. Two learners alternate in one process,
+in short blocks, so that a slow moment of the machine affects both; the speed-up is the median ratio
+over pairs of neighbouring blocks, with its quartiles. The start-up is that of a fresh process, from
+the interpreter to the first update, with an empty compilation cache.
 
-Beside them, `learn_compiled`: environment and updates in one program, several seeds side by side.
-What no code around them can save: `products` are the matrix products of SAC's update with these
-networks and this batch, and nothing else, compiled and timed by turns with the whole.
+Two more kinds of rows have no peer: `learn_compiled`, with environment and updates in one program
+and several seeds side by side; and `products`, the matrix products of SAC's update with these
+networks and this batch alone, compiled and timed in alternation with the complete update, which no
+code around them can save.
 
-A second table says what SBX gains over SB3, both measured beside ours; it is said to be up to
-twenty times, and depends on how many updates there are for each step in the environment.
+A second table has the gain of SBX over SB3, computed from both comparisons. It is reported to be up
+to twenty times, and depends on the number of updates per step.
 """
 
 import argparse
-import json
 import os
 import sys
 import time
 
 import numpy as np
 import pandas as pd
-from runs import CACHE, RESULTS, fresh_process, others_waiting, resume, seconds_since_start
+from runs import (
+    CACHE,
+    RESULTS,
+    arguments_of,
+    fresh_process,
+    others_waiting,
+    resume,
+    seconds_since_start,
+)
 
 ENV, BATCH, STARTS = "Pendulum-v1", 256, 100
 WIDE = {"pi": [256, 256], "qf": [1024, 1024]}
-#: ours, its peer, and what both are made with
+#: our class, its peer, and the arguments of both
 PAIRS = {
     "sac": ("GSDESAC", {"use_sde": False}, "SAC", {}),
     "gsde_sac": ("GSDESAC", {"policy_kwargs": {"log_std_init": -3.0}}, "SAC", {"use_sde": True}),
@@ -61,7 +69,7 @@ IN_SB3 = ("sac", "gsde_sac", "tqc", "crossq")
 ALONE = {"td7": ("TD7", {"use_checkpoints": False}), "bro": ("BRO", {})}
 RATIOS = (1, 20)
 N_BLOCKS = 9
-#: of a block of the slower of two, about [s]
+#: approximate duration of a block of the slower of two learners [s]
 BLOCK_S = {"cpu": 3.0, "cuda": 0.5}
 SEEDS = (1, 2, 4, 8)
 
@@ -72,19 +80,14 @@ def main() -> None:
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--on", default="cpu", choices=list(BLOCK_S))
     parser.add_argument("--jobs", type=int, default=1, help="one measures, the others compile")
-    parser.add_argument("--worker", nargs=3, metavar=("NAME", "RATIO", "PEER"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        name, ratio, peer = arguments.worker
-        print(json.dumps(worker(name, int(ratio), peer)))
-        return
+    arguments = arguments_of(parser, worker)
     on = arguments.on
     platforms = on if on == "cpu" else f"{on},cpu"
     os.environ |= {"JAX_PLATFORMS": platforms, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     name = "speed" if on == "cpu" else f"speed_{on}"
     if not arguments.table:
         wanted = [run for run in rows(on) if chosen(run, arguments.rows)]
-        in_process = lambda *run: fresh_process(__file__, *run, cache=cache_of(run))["rows"]  # noqa: E731
+        in_process = lambda *run: fresh_process(__file__, *run, cache=cache_of(run))  # noqa: E731
         resume(name, ("name", "ratio", "peer"), wanted, in_process, arguments.jobs)
     report(name)
 
@@ -107,15 +110,15 @@ def chosen(run: tuple[str, int, str], words: list[str] | None) -> bool:
 
 
 def cache_of(run: tuple[str, int, str]):
-    """A start-up compiles everything."""
+    """Start-ups are measured with an empty compilation cache."""
     return None if "start-up" in run[2] else CACHE
 
 
 def worker(name: str, ratio: int, peer: str) -> dict:
     if peer.startswith("start-up"):
-        return {"rows": [{"start_up_s": start_up(name, peer.split()[-1])}]}
+        return {"start_up_s": start_up(name, peer.split()[-1])}
     if peer == "compiled":
-        return {"rows": [compiled(name, ratio)]}
+        return compiled(name, ratio)
     models = [ours(name, ratio)] + ([] if peer == "none" else [other(name, ratio, peer)])
     for model in models:
         model.learn(STARTS + 20)
@@ -128,22 +131,22 @@ def worker(name: str, ratio: int, peer: str) -> dict:
         low, faster, high = np.quantile(seconds[:, 1] / seconds[:, 0], (0.25, 0.5, 0.75))
         row |= {"peer_steps_per_s": steps / middle[1]}
         row |= {"speed_up": faster, "low": low, "high": high}
-    return {"rows": [row]}
+    return row
 
 
 def block_length(models: list) -> int:
-    """:return: steps that take the slower of them about ``BLOCK_S``"""
+    """:return: number of steps for which the slower learner needs about ``BLOCK_S``"""
     slowest = max(turn(models, 10, backwards=False)) / 10
     return int(np.clip(BLOCK_S[device()] / slowest, 5, 500))
 
 
 def device() -> str:
-    """:return: on which all of them compute"""
+    """:return: name of the device that all learners use"""
     return os.environ["JAX_PLATFORMS"].partition(",")[0]
 
 
 def turn(models: list, steps: int, backwards: bool) -> list[float]:
-    """:return: seconds that each of them takes, one after the other"""
+    """:return: seconds of each learner, run one after the other"""
     seconds = [0.0] * len(models)
     order = range(len(models))
     for i in reversed(order) if backwards else order:
@@ -235,7 +238,7 @@ def start_up(name: str, who: str) -> float:
 
 
 def compiled(name: str, n_seeds: int) -> dict:
-    """Steps of all seeds together in a second, compiled before."""
+    """Steps per second of all seeds together, compilation excluded."""
     from sb3_hds.algos import learn_compiled
 
     model, steps = ours(name, 1), 2_000
@@ -271,24 +274,24 @@ def report(name: str) -> None:
             print(f"\n{table.to_string(index=False, float_format='%.3g')}")
 
 
-def wanted(ratio: int, peer: str) -> float:
-    """:return: how many times as fast as the peer ours shall be"""
+def target(ratio: int, peer: str) -> float:
+    """:return: target of the speed-up"""
     if peer == "sb3":
         return 3.0
     return 1.3 if ratio == 20 else 1.0
 
 
 def beside_targets(measured: pd.DataFrame) -> pd.DataFrame:
-    """:return: a row for each pair, with the speed-up that it shall have"""
+    """:return: a row for each pair, with the target of its speed-up"""
     pairs = measured[measured["peer"].isin(("sbx", "sb3"))]
     pairs = pairs[["name", "ratio", "peer", "speed_up", "low", "high"]].copy()
-    pairs["wanted"] = [wanted(*pair) for pair in pairs[["ratio", "peer"]].itertuples(index=False)]
-    pairs["reached"] = np.where(pairs["speed_up"] >= pairs["wanted"], "yes", "no")
+    pairs["target"] = [target(*pair) for pair in pairs[["ratio", "peer"]].itertuples(index=False)]
+    pairs["reached"] = np.where(pairs["speed_up"] >= pairs["target"], "yes", "no")
     return pairs
 
 
 def sbx_beside_sb3(measured: pd.DataFrame) -> pd.DataFrame:
-    """:return: how many times as fast SBX is, from the speed-ups of ours beside both"""
+    """:return: speed-up of SBX over SB3, the quotient of our speed-ups over both"""
     wide = measured.pivot_table("speed_up", ["name", "ratio"], "peer").reindex(
         columns=["sbx", "sb3"]
     )
@@ -297,7 +300,7 @@ def sbx_beside_sb3(measured: pd.DataFrame) -> pd.DataFrame:
 
 
 def products(measured: pd.DataFrame) -> pd.DataFrame:
-    """:return: what share of the time of a whole step its matrix products alone would take"""
+    """:return: share of the matrix products in the time of a complete step"""
     rows = measured[measured["peer"] == "products"]
     return rows[["name", "ratio", "speed_up", "low", "high"]].rename(
         columns={"speed_up": "share_of_products"}
@@ -314,7 +317,7 @@ def start_ups(measured: pd.DataFrame) -> pd.DataFrame:
 
 
 def alone(measured: pd.DataFrame) -> pd.DataFrame:
-    """:return: what has no peer; of the compiled path, ``ratio`` is the number of seeds"""
+    """:return: rows without a peer; for the compiled path, ``ratio`` is the number of seeds"""
     rows = measured[measured["peer"].isin(("none", "compiled"))]
     return rows[["name", "ratio", "peer", "steps_per_s", "updates_per_s"]]
 

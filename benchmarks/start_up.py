@@ -1,27 +1,27 @@
 """
-How soon a policy is there, beside the state before and beside SBX's SAC.
+The time until a first policy, compared with an earlier version and with SBX's SAC.
 
     git worktree add /tmp/before COMMIT
     python benchmarks/start_up.py --before /tmp/before --rounds 3
     python benchmarks/start_up.py --table
 
-Pendulum-v1, default arguments, seed 0. Cold: a fresh process, and no compiled program kept. Warm: a
-fresh process with what the cold one has kept. They take turns, so that a slow moment of the machine
-meets all of them; the table shows the smallest of the rounds, in seconds of wall time and of the
-processor, which other work on the machine disturbs less. Columns, each beyond the one before:
+Pendulum-v1, default arguments, seed 0. Cold: a fresh process with an empty compilation cache. Warm:
+a fresh process with the cache of the cold one. The programs alternate, so that a slow moment of the
+machine affects all; the table has the smallest of the rounds, in seconds of wall time and of
+processor time, which depends less on other load. Columns, each counted from the end of the one
+before:
 
-- `base`: `import jax, stable_baselines3`, with what the interpreter takes
+- `base`: the interpreter and `import jax, stable_baselines3`
 - `imports`, `construct`: ours, or SBX's
-- `first_plan`: to the end of the first planning epoch; of SBX, the first update
-- `epoch_ms`: the least of an epoch's
+- `first_plan`: to the end of the first planning epoch; for SBX, of the first update
+- `epoch_ms`: the shortest epoch
 
-`weights` is a digest of what was learned in the first epochs: equal where numbers are the same. The
-commands of `sb3-hds` are timed likewise.
+`weights` is a hash of the networks after the first epochs: equal where the numbers are the same.
+The commands of `sb3-hds` are timed in the same way.
 """
 
 import argparse
 import hashlib
-import json
 import os
 import resource
 import subprocess
@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from runs import RESULTS, fresh_process, save
+from runs import RESULTS, arguments_of, fresh_process, save
 
 HERE = Path(__file__).parent.parent
 COMMANDS = ("--help", "effects")
@@ -48,15 +48,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--only", nargs="*", default=["ours", "before", "sbx"])
     parser.add_argument("--table", action="store_true")
-    parser.add_argument("--worker", nargs=3, metavar=("WHO", "CHECKOUT", "CACHE"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        who, checkout, cache = arguments.worker
-        os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
-        os.environ["SB3_HDS_CACHE"] = cache
-        sys.path.insert(0, checkout)
-        print(json.dumps(sbx() if who == "sbx" else hds()))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.table:
         checkouts = {"ours": HERE, "sbx": HERE}
         if arguments.before:
@@ -67,6 +59,13 @@ def main() -> None:
                 rows += [row | {"round": number} for row in measured(who, checkouts[who])]
                 save(rows, "start_up")
     report()
+
+
+def worker(who: str, checkout: str, cache: str) -> dict[str, Any]:
+    os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+    os.environ["SB3_HDS_CACHE"] = cache
+    sys.path.insert(0, checkout)
+    return sbx() if who == "sbx" else hds()
 
 
 def measured(who: str, checkout: Path) -> list[dict[str, Any]]:
@@ -101,7 +100,7 @@ class Marks:
 
     def __init__(self) -> None:
         self.found: dict[str, Any] = {}
-        # Including what the interpreter took to come here.
+        # Includes the start of the interpreter.
         self._wall = float(os.environ["BENCHMARK_START"]), 0.0
 
     def mark(self, name: str) -> None:
@@ -161,7 +160,7 @@ def sbx() -> dict[str, Any]:
 
 
 def counter(jax: Any) -> Callable[[], int]:
-    """:return: says how many programs were compiled, and not taken from where they are kept"""
+    """:return: function that returns how many programs were compiled, cached ones not counted"""
     counts = {"backend_compile_duration": 0, "cache_hits": 0}
 
     def count(event: str, *_: Any, **__: Any) -> None:
@@ -190,15 +189,15 @@ def report() -> None:
 
 
 def summary(least: pd.DataFrame) -> list[dict[str, Any]]:
-    """:return: what the docs show of starts, one row each"""
+    """:return: one row for each start, for the docs"""
     starts = {"before": "before", "ours": "now", "sbx": "SBX SAC"}
     return [
         {
-            "": name,
+            "version": name,
             "start": state,
             "own imports and construction [s]": row["own_s"],
             "first plan or update after construction [s]": row["first_plan_s"],
-            "in all [s]": row["total_s"],
+            "total [s]": row["total_s"],
             "processor [s]": row["total_cpu_s"],
             "programs compiled": row["compiled"],
             "epoch [ms]": row["epoch_ms"],

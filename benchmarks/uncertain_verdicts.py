@@ -1,37 +1,39 @@
 """
-What a belief is worth: policies from it, from single answers and from guessed boxes, where data
-leave open what is wrong.
+The value of a belief to a policy, compared with single explanations and domain randomisation.
 
     python benchmarks/uncertain_verdicts.py --seeds 5
     python benchmarks/uncertain_verdicts.py --report-only
 
-Four situations, two machines. Of the pendulum, which MuJoCo's engine simulates
-(`sb3_hds/PendulumReal-v1`): a weak drive that is as well a heavier rod, and drag of which gentle
-motion tells no more than that something brakes. Of the cart-pole, a twin with an effect that the
-one under diagnosis lacks: commands that come late by 20 ms +- 20 ms, which a data sheet says and no
-recording, and drag on the pole where only drives and dry friction were suspected, so that something
-stays without a name. Each seed makes its own recordings, or its own delay, and diagnoses them.
+There are four situations on two machines, in which the data leave open what is wrong. The pendulum
+is simulated by MuJoCo's engine (`sb3_hds/PendulumReal-v1`): a weak drive that could as well be a
+heavier rod, and drag that gentle motion cannot distinguish from other friction. The cart-pole is a
+twin with an effect that the twin under diagnosis lacks: commands that are late by 20 ms +- 20 ms,
+known from a data sheet and from no recording, and drag on the pole where only drives and dry
+friction were suspected, so that a residual remains without a name. Each seed makes its own
+recordings, or draws its own delay, and diagnoses them.
 
-HDS is trained without a real step in each of these: the nominal twin; each answer that the
-diagnosis leaves open; boxes of 20 % and 50 % around the nominal twin's parameters and the drive's
-gain, uniform; the belief; the truth. All policies act from the same 20 start states. `real`: mean
-return on the machine; `decile`: its lowest decile over start states; `worst`: the lowest mean
-return over machines that are each of the answers and the real one. The first name is the likeliest
-answer, the worst member that of the answers whose policy has the lowest `worst`.
+HDS is trained without a real step in the nominal twin; in the twin of each explanation that the
+diagnosis leaves open; in uniform boxes of 20 % and 50 % around the parameters of the nominal twin
+and the gain of the drive; in the belief; and in the true twin. All policies act from the same 20
+start states. `real`: mean return on the machine; `decile`: its lowest decile over start states;
+`worst`: the lowest mean return over the real machine and those that the explanations describe. The
+first name is the most likely explanation, the worst member the one whose policy has the lowest
+`worst`.
 
-Each run is a process of its own. Runs that are in the table are not done again, and one that was
-interrupted goes on with the policy that it was at.
+Each run is a process of its own. Finished runs are kept, and an interrupted one resumes at its
+current policy.
 """
 
 import argparse
 import json
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from hidden_cases import write
 from intervals import of_mean
-from runs import CACHE, RESULTS, fresh_process, resume, save, seconds_since_start
+from runs import CACHE, RESULTS, arguments_of, fresh_process, resume, save, seconds_since_start
 
 EPISODES, EPOCHS = 20, 60
 # Of answers that are trained in, the likeliest, and of draws.
@@ -45,9 +47,9 @@ _DELAY = 0.02  # [s], of the cart-pole, give or take as much
 class Situation(NamedTuple):
     """
     :param env: id of the task
-    :param hidden: what the machine has: settings of the engine's pendulum, or effects
-    :param suspects: names of effects that the diagnosis asks about
-    :param torque: of the recordings, as a share of what the drive gives
+    :param hidden: what is hidden in the machine: settings of the engine's pendulum, or effects
+    :param suspects: names of the candidate effects of the diagnosis
+    :param torque: of the recordings, as a share of the drive's limit
     :param gentle: whether recordings begin at rest, hanging
     """
 
@@ -84,15 +86,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--report-only", action="store_true")
-    parser.add_argument("--worker", nargs=2, metavar=("SITUATION", "SEED"))
-    arguments = parser.parse_args()
-    if arguments.worker:
-        situation, seed = arguments.worker
-        print(json.dumps({"rows": worker(situation, int(seed))}))
-        return
+    arguments = arguments_of(parser, worker)
     if not arguments.report_only:
         wanted = [(s, seed) for seed in range(arguments.seeds) for s in arguments.situations]
-        work = lambda *run: fresh_process(__file__, *run, cache=CACHE / "programs")["rows"]  # noqa: E731
+        work = partial(fresh_process, __file__, cache=CACHE / "programs")
         resume("uncertain_verdicts", ("situation", "seed"), wanted, work, arguments.jobs)
     report()
 
@@ -107,7 +104,7 @@ def worker(name: str, seed: int) -> list[dict[str, Any]]:
     true = truth(situation, nominal, seed)
     kept = json.loads(path.read_text()) if path.exists() else None
     if kept is None:
-        kept = asked(situation, nominal, true, seed) | {"rows": []}
+        kept = diagnosed(situation, nominal, true, seed) | {"rows": []}
         write(path, json.dumps(kept))
     back = lambda spec: twins.from_spec(spec, effects.ALL)  # noqa: E731
     members = [back(spec) for spec in kept["members"]]
@@ -136,8 +133,8 @@ def worker(name: str, seed: int) -> list[dict[str, Any]]:
     return kept["rows"]
 
 
-def asked(situation: Situation, nominal: Any, true: Any, seed: int) -> dict[str, Any]:
-    """:return: what the recordings leave open, as plain data"""
+def diagnosed(situation: Situation, nominal: Any, true: Any, seed: int) -> dict[str, Any]:
+    """:return: the explanations that the recordings leave open, as plain data"""
     from sb3_hds.sysid.belief.belief import belief_of
 
     verdict, answers = left_open(situation, nominal, true, seed)
@@ -151,7 +148,7 @@ def asked(situation: Situation, nominal: Any, true: Any, seed: int) -> dict[str,
 
 
 def truth(situation: Situation, nominal: Any, seed: int) -> Any:
-    """:return: the twin of the machine as it is"""
+    """:return: the true twin of the machine"""
     import gymnasium
 
     from sb3_hds import effects
@@ -166,7 +163,7 @@ def truth(situation: Situation, nominal: Any, seed: int) -> Any:
 
 
 def left_open(situation: Situation, nominal: Any, true: Any, seed: int) -> tuple[str, Any]:
-    """:return: the verdict on recordings of the machine, and the answers that they leave open"""
+    """:return: the verdict on recordings of the machine, and the remaining explanations"""
     from sb3_hds import Trajectories, diagnose, effects
     from sb3_hds.sysid.belief.answers import Answer, Answers
 
@@ -217,7 +214,7 @@ def machine_of(situation: Situation, true: Any, noise: float = 0.0) -> Any:
 
 
 def boxed(nominal: Any, share: float, seed: int) -> Any:
-    """:return: every parameter that is not zero, and the drive's gain, uniform in a box"""
+    """:return: draws of all nonzero parameters and of the drive's gain, uniform in a box"""
     from sb3_hds.core.belief import BeliefTwin
     from sb3_hds.effects import TorqueGain
 
@@ -259,7 +256,7 @@ def returns_in(model: Any, twin: Any) -> np.ndarray:
 
 
 def report() -> None:
-    """Print and keep means over seeds with 95 % intervals, and shares of gaps."""
+    """Print and save means over seeds with 95 % intervals, and shares of gaps."""
     table: Any = pd.read_csv(RESULTS / "uncertain_verdicts.csv")
     rows = []
     for name, own in table.groupby("situation", sort=False):
@@ -268,7 +265,7 @@ def report() -> None:
         told = own.groupby("seed").verdict.first().value_counts()
         for policy in POLICIES:
             row = {"situation": name, "policy": policy}
-            row |= {m: _told(chosen[m][policy]) for m in MEASURED}
+            row |= {m: _with_interval(chosen[m][policy]) for m in MEASURED}
             rows.append(row | {"seeds": len(by["real"]), "verdicts": _counted(told)})
         print(f"{name}: {gaps(chosen)}")
     print(save(rows, "uncertain_verdicts_intervals").to_string(index=False))
@@ -278,7 +275,7 @@ MEASURED = ("real", "decile", "worst")
 
 
 def named(frame: Any, worst: Any) -> Any:
-    """:return: with the first name and the worst member in the place of numbered answers"""
+    """:return: the frame with first name and worst member instead of numbered explanations"""
     answers = [column for column in frame if str(column).startswith("answer ")]
     lowest = worst[answers].idxmin(axis=1)
     frame = frame.copy()
@@ -303,7 +300,7 @@ def gaps(chosen: dict[str, Any]) -> str:
     return f"{told}; the belief beside {beside}"
 
 
-def _told(values: Any) -> str:
+def _with_interval(values: Any) -> str:
     middle, low, high = of_mean(list(values))
     return f"{middle:.1f}" if np.isnan(low) else f"{middle:.1f} [{low:.1f}, {high:.1f}]"
 

@@ -7,11 +7,11 @@ import pickle
 import tempfile
 from pathlib import Path
 
-# Programs that one process has compiled serve the others: workers and what they start inherit it.
+# All processes of the tests share a compilation cache, also those that they start.
 _FOLDER = tempfile.TemporaryDirectory(prefix="sb3_hds_tests_")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _FOLDER.name)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
-# Programs that run for moments need not be fast: these take half as long to compile.
+# Optimise for compile time, which this halves: the programs run only for moments.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 "
@@ -32,7 +32,7 @@ def x64():
 
 @pytest.fixture(scope="module")
 def quick_compilation():
-    """Compile for the compiler's sake: programs that run for moments need not be fast."""
+    """Optimise for compile time: the programs run only for moments."""
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
@@ -40,7 +40,7 @@ def quick_compilation():
 
 @pytest.fixture
 def no_pickle(monkeypatch):
-    """Whatever is unpickled from now on fails, but for the tensors that torch vouches for."""
+    """Unpickling anything fails from now on, except for tensors that torch loads safely."""
 
     def refuse(*_, **__):
         raise AssertionError("something was unpickled")
@@ -69,7 +69,7 @@ def few_programs():
         gc.collect()
 
 
-# Few tests, much time: a worker that gets such a file last keeps everybody waiting.
+# Slow files with few tests: a worker that got one of them last would delay the end.
 _LONG = (
     "test_hidden_effects.py",
     "test_zoo.py",

@@ -1,4 +1,4 @@
-"""Episodes that are known beforehand: what happened can be read off every observation."""
+"""Deterministic episodes, in which every observation says where it comes from."""
 
 from typing import NamedTuple
 
@@ -34,7 +34,7 @@ class Row(NamedTuple):
 
 
 def truth(copy: int, actions: np.ndarray) -> list[Row]:
-    """:return: what these actions lead to, one after the other"""
+    """:return: the transitions of these actions"""
     rows, episode, step, before = [], 0, 0, 0.0
     for action in actions:
         obs, done = (copy, episode, step, before), step + 1 == length_of(copy, episode)
@@ -47,7 +47,7 @@ def truth(copy: int, actions: np.ndarray) -> list[Row]:
 
 
 class Counting(gymnasium.Env):
-    """Whose images are as dark as its number."""
+    """Counts its episodes and steps; the grey level of its images is its number."""
 
     metadata = {"render_modes": ["rgb_array"]}
     observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float32)
@@ -59,7 +59,7 @@ class Counting(gymnasium.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        # A seed begins everything anew.
+        # A seed restarts the count of episodes.
         self.episode = 0 if seed is not None else self.episode + 1
         self.step_now = 0
         return self._obs(0.0), {"begun": self.episode, "seed": seed, "options": options}
@@ -76,7 +76,7 @@ class Counting(gymnasium.Env):
         return np.full((2, 2, 3), self.copy, np.uint8)
 
     def painted(self, colour: str) -> str:
-        """A method to be called from outside."""
+        """A method that is called through the vectorised environment."""
         return f"{colour} {self.copy}"
 
     def _obs(self, action: float) -> np.ndarray:
@@ -84,7 +84,7 @@ class Counting(gymnasium.Env):
 
 
 class CountingVector(VectorEnv):
-    """Somebody's own ``VectorEnv``: one buffer of observations, written again and again."""
+    """A user's own ``VectorEnv``, which reuses one buffer for all observations."""
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def damaged(content: bytes, n: int) -> Iterator[bytes]:
-    """:return: n versions: cut off, changed, left out, put in, or repeated elsewhere"""
+    """:return: n versions: truncated, or with bytes changed, removed, inserted or repeated"""
     rng = np.random.default_rng(0)
     for number in range(n):
         broken = bytearray(content)

@@ -1,4 +1,4 @@
-"""Small inputs on which the product went wrong at first users', with the right answers."""
+"""Small inputs of first users for which a diagnosis was wrong, with the right answers."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""A free mass on a rail: the plainest twin, on which the physics of an effect can be computed."""
+"""A free mass on a rail: the simplest twin, for which the physics of an effect is known exactly."""
 
 import jax
 import jax.numpy as jnp

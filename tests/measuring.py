@@ -1,4 +1,4 @@
-"""Data as a rig would give them, simulated by a twin whose truth is known."""
+"""Synthetic recordings, simulated by a twin with known parameters."""
 
 import functools
 
@@ -20,7 +20,7 @@ def _observed(twin, params, keys, actions):
 def measured(twin, n=8, n_steps=60, noise=0.0, seed=0, share=0.8, commands=None):
     """
     :param noise: standard deviation of each channel
-    :param share: of the range of commands that is used
+    :param share: used share of the range of commands
     :param commands: instead of smooth random ones, shape ``(n, n_steps, n_act)``
     :return: episodes, all from the twin's own start states
     """
@@ -35,7 +35,7 @@ def measured(twin, n=8, n_steps=60, noise=0.0, seed=0, share=0.8, commands=None)
 
 
 def jumping(n, n_levels=20, each=10, size=4.0):
-    """:return: commands that jump now and then, shape ``(n, n_levels * each, 1)``"""
+    """:return: piecewise constant commands, shape ``(n, n_levels * each, 1)``"""
     return size * np.random.default_rng(1).standard_normal((n, n_levels, 1)).repeat(each, 1)
 
 

@@ -1,4 +1,4 @@
-"""Environments whose commands are speeds, exactly integrated: what safety layers assume."""
+"""Environments with exactly integrated speed commands, as safety layers assume."""
 
 import gymnasium
 import numpy as np
@@ -8,7 +8,7 @@ DT = 0.05  # [s]
 
 
 class MovingJoints(gymnasium.Env):
-    """Joints that move as fast as they are told, but for a lag, and are best at ``goal``."""
+    """Joints that move at the commanded speed, except for a lag; best at ``goal``."""
 
     dt = DT
 

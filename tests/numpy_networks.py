@@ -1,4 +1,4 @@
-"""Updates in plain NumPy: slopes are central differences in every single weight."""
+"""Updates in plain NumPy; gradients are central differences in every weight."""
 
 from collections.abc import Callable
 from typing import Any

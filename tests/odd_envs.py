@@ -1,4 +1,4 @@
-"""Environments with one thing that is odd: any spaces, or a sensor that dies."""
+"""Environments with one peculiarity: arbitrary spaces, or a sensor that fails."""
 
 import gymnasium
 import numpy as np
@@ -9,7 +9,7 @@ OBS, ACT = spaces.Box(-1.0, 1.0, (3,)), spaces.Box(-1.0, 1.0, (1,))
 
 
 class AnySpaces(gymnasium.Env):
-    """Observes whatever its space has. Episodes have ten steps that earn 1 each."""
+    """Observations are samples of its space. Episodes have ten steps with a reward of 1 each."""
 
     def __init__(self, observation_space: spaces.Space = OBS, action_space=ACT) -> None:
         self.observation_space, self.action_space = observation_space, action_space

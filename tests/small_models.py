@@ -1,4 +1,4 @@
-"""Every algorithm, so small that a test of it takes moments: tests ask whether, not how well."""
+"""Every algorithm with small networks and budgets: the tests check that it works, not how well."""
 
 import io
 import zipfile

@@ -1,4 +1,4 @@
-"""Small robots as MJCF, written for the tests: nothing touches, everything else varies."""
+"""Small robots as MJCF, without contacts and otherwise as varied as possible."""
 
 import mujoco
 

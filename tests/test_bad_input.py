@@ -182,7 +182,7 @@ class Own(algos.DroQ):
         super().__init__(*args, **kwargs)
 
 
-def test_somebodys_own_constructor_may_take_what_it_likes_and_keeps_its_settings():
+def test_a_users_algorithm_may_have_its_own_constructor_and_keeps_its_settings():
     given = {"net_arch": [8]}
     model = Own("Pendulum-v1", **SMALL["droq"] | {"policy_kwargs": given}, extra=3)
 

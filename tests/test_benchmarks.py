@@ -1,7 +1,8 @@
-"""What the benchmarks run, compute from their tables, and keep between runs."""
+"""What benchmarks run, compute from their tables, and save between runs."""
 
 from importlib.util import find_spec
 from inspect import signature
+from pathlib import Path
 
 import intervals
 import model_free
@@ -67,6 +68,23 @@ def test_a_run_that_was_stopped_before_its_end_is_made_again_in_place(monkeypatc
     assert asked == [0]
     found = pd.read_csv(tmp_path / "table.csv")
     assert found.to_dict("list") == {"seed": [1, 0, 0], "mark": [2, 1, 2]}
+
+
+def test_a_worker_gets_values_of_the_types_of_its_parameters_and_its_result_comes_back(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"""
+import argparse, sys
+sys.path.insert(0, {str(Path(runs.__file__).parent)!r})
+from runs import arguments_of
+
+def worker(name: str, seed: int, share: float) -> list:
+    return [{{name: seed + share}}]
+
+arguments_of(argparse.ArgumentParser(), worker)
+"""
+    )
+    assert runs.fresh_process(str(script), "a, b", 1, 0.5) == [{"a, b": 1.5}]
 
 
 @pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="needs the extra 'zoo'")

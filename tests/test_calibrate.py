@@ -71,7 +71,7 @@ def test_what_happened_before_a_window_counts():
     assert abs(found.estimate - 0.05) < 3.0 * found.stderr < 0.003
 
 
-def test_it_agrees_with_scipy_on_the_whole_problem(x64):
+def test_it_agrees_with_scipy_on_the_complete_problem(x64):
     """Parameters and start states together, by another solver, without elimination."""
     data = measured(TRUE, n=3, n_steps=21, noise=0.02)
     fit = calibrate(BELIEVED, data, window=10, loss="linear", **PADDED)

@@ -87,7 +87,7 @@ def test_what_is_said_of_a_limit_is_of_episodes_that_it_cut():
     assert "Episode length" in topics(TimeLimit(Drawn(mixed), 20))
 
 
-def test_a_cost_for_each_step_is_no_constant_reward_where_something_ends_it():
+def test_a_cost_for_each_step_is_no_constant_reward_where_episodes_can_end():
     def until_the_goal(env, action):
         there = env.np_random.random() < 0.02
         return -1.0, there, {"is_success": there}

@@ -315,7 +315,7 @@ def test_where_nothing_was_found_no_policies_are_compared(asked, tmp_path, capsy
     assert "no policies to compare" in capsys.readouterr().out
 
 
-def test_a_log_without_a_map_of_columns_is_told_how_to_write_one(tmp_path, capsys):
+def test_a_log_without_a_column_map_is_refused_with_the_way_to_write_one(tmp_path, capsys):
     log, empty = tmp_path / "log.csv", tmp_path / "map.yml"
     log.write_text("t,q\n0.0,0.1\n")
     empty.write_text("[]")

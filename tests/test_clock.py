@@ -134,7 +134,7 @@ def test_intervals_that_vary_by_themselves_are_no_regular_clock(spread):
     assert "no regular clock" in report.clocks()
 
 
-def test_a_clock_that_drifts_slowly_is_told_from_jitter():
+def test_a_clock_that_drifts_slowly_is_distinguished_from_jitter():
     """Two crystals: in a minute, the rate changes by 500 ppm; rows end up 1.5 off a line."""
     t = regular(n=6000)
     slow, fast = ((1.0 + 0.5 * change * t / t[-1]) * t for change in (5e-4, 2e-2))

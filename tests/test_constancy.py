@@ -61,7 +61,7 @@ def test_what_changes_is_seen_and_its_gain_is_that_of_a_fit_that_follows_it():
     assert np.mean([one.gain for one in found]) == pytest.approx(change**2 / 24.0, rel=0.1)
 
 
-def test_what_changes_less_than_anybody_minds_or_in_one_window_alone_is_constant():
+def test_changes_within_practical_equivalence_or_in_a_single_window_count_as_constant():
     curvature, scores, waves = windows(np.random.default_rng(1), change=40.0)
     unminded = _tested(curvature / 100.0, scores / 100.0, SIZE, waves)
     curvature[1:, SIZE], curvature[1:, :, SIZE], scores[1:, SIZE] = 0.0, 0.0, 0.0

@@ -84,7 +84,7 @@ def test_a_damaged_replay_buffer_says_so_and_the_one_of_before_stays():
         model.replay_buffer = before
 
 
-def test_files_that_are_not_there_or_something_else_are_named(tmp_path):
+def test_missing_files_and_files_of_another_kind_are_named(tmp_path):
     (tmp_path / "notes.zip").write_text("no model")
     with zipfile.ZipFile(tmp_path / "pictures.zip", "w") as pictures:
         pictures.writestr("one.png", b"")

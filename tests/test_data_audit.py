@@ -359,7 +359,7 @@ def test_motion_within_noise_is_not_usable_and_rest_most_of_the_time_is():
     (lambda obs, noise: 100.0 + 0.4 * noise, "ConstantCommand", "between 99.6 and 100.4"),
     (lambda obs, noise: obs[:-1] @ [[0.3], [1.0], [-0.2]], "DependentCommand", "action[0]"),
 )
-def test_a_command_that_tells_nothing_of_its_own_is_found(command, kind, says, data):
+def test_commands_without_information_of_their_own_are_found(command, kind, says, data):
     rng = np.random.default_rng(0)
 
     def commanded(_, obs, actions):
@@ -545,7 +545,7 @@ def test_a_backward_difference_is_recognised_and_offered_as_a_correction(digits)
         assert kinds(audit(alone(seen), KNOWN)) <= {"PoorExcitation"}
 
 
-def test_a_backward_difference_is_told_from_the_steps_of_a_twin_and_moved_back_for_a_diagnosis():
+def test_a_backward_difference_is_distinguished_from_steps_of_a_twin_and_shifted_for_a_diagnosis():
     force = np.sin(0.2 * np.random.default_rng(0).standard_normal((8, 200, 1)).cumsum(1))
     twin = twins.make("LinearAxis")
     differences = differentiated(measured(twin, n_steps=200, commands=force))

@@ -82,7 +82,7 @@ def test_patterns_give_files_in_alphabetical_order_and_lists_keep_theirs(tmp_pat
         Trajectories.load([tmp_path / "a.csv", str(tmp_path / "*.csv")], columns=COLUMNS)
 
 
-def test_episodes_are_told_apart_by_a_column_and_by_another_condition(tmp_path):
+def test_a_column_or_a_new_condition_separates_episodes(tmp_path):
     one, two = swing(20), swing(30)
     table = {name: np.concatenate([one[name], two[name], two[name]]) for name in one}
     run, load = (np.repeat(labels, [20, 30, 30]) for labels in ([0, 1, 1], [0.5, 1, 2]))

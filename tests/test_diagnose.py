@@ -58,7 +58,7 @@ def expensive(*values):
     return pytest.param(*values, marks=pytest.mark.expensive)
 
 
-def test_horizons_at_which_a_named_cause_makes_it_worse_are_told():
+def test_horizons_at_which_a_named_cause_makes_predictions_worse_are_reported():
     better = HorizonGain(10, 2.0, 1.0, 0.4, 0.6)
     unsure = HorizonGain(5, 1.0, 1.1, -0.2, 0.01)
     worse = HorizonGain(1, 1.0, 1.2, -0.3, -0.1)
@@ -97,7 +97,7 @@ def test_nothing_is_named_where_nothing_is_wrong():
     assert not found.findings and not found.unexplained and found.twin == TWIN
 
 
-def test_what_the_data_cannot_tell_apart_is_said():
+def test_causes_that_the_data_cannot_distinguish_are_reported():
     """A heavier rod and a weaker drive are the same thing, seen from outside."""
     found = asked(on_engine(mass=1.15))
 
@@ -155,7 +155,7 @@ def test_a_joint_that_is_counted_the_other_way_round_is_a_matter_of_convention()
     expensive(effects.StribeckFriction("hinge", tau_c=0.01, tau_s=0.03, v_s=0.6), 0.05),
     ids=lambda value: getattr(value, "name", None),
 )
-def test_what_a_search_from_where_nothing_is_wrong_misses_is_found(effect, strength):
+def test_a_cause_that_a_search_from_the_null_model_misses_is_found(effect, strength):
     """There it has no slope, or a local optimum is near: the search has to know where to begin."""
     pushed, data = swinging(effect, strength=strength)
     kinds = [type(effect), effects.ViscousFriction]
@@ -167,7 +167,7 @@ def test_what_a_search_from_where_nothing_is_wrong_misses_is_found(effect, stren
             assert one.estimate == pytest.approx(effect.values[name], rel=0.1), name
 
 
-def test_nothing_is_not_the_verdict_where_held_out_recordings_surely_prefer_something():
+def test_the_verdict_is_not_none_where_held_out_recordings_significantly_prefer_a_candidate():
     late = Candidate("sensor_delay", "channel", "angle", 0, ("sensor_delay.angle.delay",), "")
     gains = lambda gain, p: (late, Comparison(gain, p, 0.0, 1.0, 4))  # noqa: E731
     by_chance = [gains(0.3, 0.3)] * 9
@@ -192,7 +192,7 @@ SLACK = effects.ClearanceSpring("hinge", k=0.3, low=-0.3, high=0.3), RUBBING
     # Whoever asks about one gets its name.
     expensive([YIELDING], [*effects.NAMELESS, "CoulombFriction"], ["hysteresis"], ""),
 )
-def test_a_force_without_a_name_is_told_and_no_finding(planted, kinds, named, told):
+def test_a_force_without_a_name_is_reported_but_is_no_finding(planted, kinds, named, told):
     pushed, data = swinging(*planted, n=10, n_steps=150)
     found = asked(data, pushed, effects=kinds, budget="full" if len(kinds) == 2 else "quick")
 
@@ -294,7 +294,7 @@ def tried(name, criterion=60.0):
     # However surely: a hundredth of the error is what any model may be off by.
     (0.01, 0.005, 0.003, "gain"),
 )
-def test_what_is_confirmed_is_given_up_only_for_something_simpler_that_is_as_good_and_confirmed(
+def test_a_confirmed_cause_is_replaced_only_by_a_simpler_confirmed_one_that_is_as_good(
     p_of_simple, gain_over_simple, p_over_simple, chosen
 ):
     p_values = {"tau_c mu": 0.003, "gain": p_of_simple}
@@ -456,7 +456,7 @@ def test_no_size_is_certain_where_simulations_blow_up_nearby():
     assert np.isposinf(errors).all()
 
 
-def test_several_causes_are_told_as_those_of_a_machine():
+def test_the_sentence_on_several_causes_summarises_them_by_joint():
     def finding(effect, joint, size, unit, share=None, others=()):
         where, key = {"slot": "joint", "name": joint}, f"{effect}.{joint}"
         estimate = SimpleNamespace(estimate=size, unit=unit, before=0.0)

@@ -73,7 +73,7 @@ def test_an_extended_twin_is_asked_again_by_names_and_a_glitch_is_cut_out_and_sa
     assert "'hinge_position' jumps" in said
 
 
-def test_less_of_what_the_twin_has_is_told_as_what_is_added_to_it():
+def test_less_of_a_property_of_the_twin_is_reported_like_an_added_effect():
     found = asked(TWIN.with_parameters(damping=0.003), recorded(TWIN))
     estimate = found.findings[0].parameters["b"]
     assert estimate.estimate == pytest.approx(-0.003, rel=0.05)

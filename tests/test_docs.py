@@ -1,4 +1,4 @@
-"""What the pages of the documentation show works, and what they generate is what the code is."""
+"""Code and commands on the pages of the documentation work, and generated parts match the code."""
 
 import ast
 import inspect
@@ -32,7 +32,7 @@ import reference  # noqa: E402
 
 PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("[!_]*/[!_]*.md"), ROOT / "README.md"])
 
-# The pages show the defaults that a user wants; here it is enough that the code runs.
+# Pages show the defaults that a user wants; here the code only has to run.
 SMALL = dict.fromkeys(("pretrain_epochs", "lookahead", "gradient_steps", "n_random_plans"), 0)
 SMALL |= {"n_rollouts": 4, "horizon": 4, "planner": "first_order", "train_freq": 200}
 SMALL |= {"terminal_value": False}
@@ -55,7 +55,7 @@ def name_of(page: Path) -> str:
 
 
 def blocks(page: Path, language: str) -> list[str]:
-    """The code of a page, on the lines where it stands, so that tracebacks point there."""
+    """The code of a page at its original line numbers, so that tracebacks are right."""
     text = page.read_text()
     found = [match for match in _FENCE.finditer(text) if match[1] == language]
     return ["\n" * text.count("\n", 0, match.start(2)) + match[2] for match in found]

@@ -144,7 +144,7 @@ def test_an_effect_says_what_it_is_and_where_it_comes_from(effect):
     assert [other.name for other in ENTRIES].count(effect.name) == 1
 
 
-def test_what_cannot_be_told_apart_is_known_and_says_so_on_both_sides():
+def test_effects_declare_their_equivalents_mutually():
     declared = {effect.name: effect.equivalents for effect in effects.ALL}
     owners = map(twins.get, twins.names())
     parameters = {f"parameter.{name}" for twin in owners for name in twin.parameters}

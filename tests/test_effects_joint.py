@@ -173,7 +173,7 @@ def test_a_hardening_spring_has_the_period_of_the_cubic_oscillator(x64):
     assert crossings[1] - crossings[0] == pytest.approx(period, abs=1e-4)
 
 
-def test_cogging_snaps_to_places_one_period_apart(x64):
+def test_cogging_snaps_to_positions_at_a_distance_of_one_period(x64):
     cogging = Cogging(amplitude=0.4, period=0.5, phase=0.1)
 
     for rest in (0.1, -0.4):

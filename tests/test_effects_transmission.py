@@ -53,7 +53,7 @@ def test_neither_spring_nor_play_gains_energy_however_long_the_sub_step(
 
 
 @every_transmission
-def test_a_whole_joint_follows_two_bodies_that_are_integrated_by_another_solver(x64, effect):
+def test_a_joint_with_a_transmission_follows_two_bodies_integrated_by_another_solver(x64, effect):
     """A pendulum under a wandering torque: its motor and its rod as bodies of their own."""
     share, inertia, step = 0.3, 1.0 / 3.0, 1e-3
     effect = type(effect)(0, motor_share=share, **effect.values)

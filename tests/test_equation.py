@@ -225,7 +225,7 @@ def test_a_force_meets_what_a_servo_brakes_within_a_step():
     np.testing.assert_allclose(inertia, expected, rtol=1e-6, atol=1e-9)
 
 
-def test_a_late_bus_and_dry_friction_are_told_of_a_servo_driven_leg_from_positions_alone():
+def test_a_late_bus_and_dry_friction_of_a_servo_driven_leg_are_found_from_positions_alone():
     found = proposed(servo_leg.leg(), servo_leg.recorded(delay=0.012, friction=0.2))
 
     # A tenth of the interval at which commands are held.
@@ -259,7 +259,7 @@ def test_a_spring_that_hardens_is_one_whatever_the_clock(slower):
         (first_users.flipped_command, "direction"),
     ],
 )
-def test_a_log_in_other_conventions_is_told_before_any_cause(given, name):
+def test_other_conventions_of_a_log_are_reported_before_any_cause(given, name):
     twin, data = given()
     found = other_convention(twin, motion(twin, data), ())
 
@@ -293,7 +293,7 @@ def test_differences_of_a_parabola_are_its_slope_when_the_velocity_is_true(shift
     np.testing.assert_allclose(found[:, 1], 1.0)
 
 
-def test_smoothing_takes_noise_away_and_no_motion():
+def test_smoothing_removes_noise_and_no_motion():
     rng, dt = np.random.default_rng(0), 0.01
     t = dt * np.arange(1001)
     q, v = np.sin(2.0 * t), 2.0 * np.cos(2.0 * t)

@@ -19,7 +19,7 @@ SCALE = pytest.approx(1.04, abs=0.005)
     (first_users.scaled_angle, ["inertia", "damping"], {"sensor_scale.hinge": {"scale": SCALE}}),
     ids=["friction", "let go", "scaled"],
 )
-def test_what_somebody_had_is_found(given, calibrate, expected):
+def test_cases_of_first_users_are_found(given, calibrate, expected):
     twin, data = given()
 
     found = diagnose(twin, data, calibrate=calibrate, progress=False)

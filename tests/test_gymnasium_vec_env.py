@@ -83,7 +83,7 @@ def test_environments_in_other_processes_are_stored_as_truly():
         env.close()
 
 
-def test_somebodys_own_environment_is_stored_as_truly():
+def test_transitions_of_a_users_own_vector_env_are_stored_correctly():
     own = CountingVector(N, AutoresetMode.NEXT_STEP, knows_masks=True)
     envs = [
         GymnasiumVecEnv(CountingVector(N, AutoresetMode.SAME_STEP, "final_obs")),
@@ -124,7 +124,7 @@ def test_an_environment_that_does_not_keep_to_its_mode_is_found_when_it_ends(env
 
 
 @every_mode
-def test_episodes_are_told_as_monitor_tells_them(mode):
+def test_episodes_are_reported_as_by_monitor(mode):
     env = GymnasiumVecEnv(sync(mode, 1))
     monitored = Monitor(Counting(0))
     env.reset(), monitored.reset()
@@ -190,7 +190,7 @@ def test_copies_can_be_reached():
 
 
 @every_mode
-def test_dictionaries_and_choices_are_taken_apart(mode):
+def test_dictionaries_and_discrete_spaces_are_split(mode):
     space = spaces.Dict(told=spaces.Box(-1.0, 9.0, (1,)), step=spaces.Discrete(9))
 
     def choosing():

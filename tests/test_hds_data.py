@@ -85,7 +85,7 @@ def test_a_twin_that_is_exact_is_left_alone():
     assert recorded(hybrid) == line | {f"model/{name}": n for name, n in expected.items()}
 
 
-def test_parameters_are_corrected_and_suspects_that_explain_nothing_let_go(found):
+def test_parameters_are_corrected_and_suspects_that_explain_nothing_are_removed(found):
     line = recorded(found)
 
     assert found.changed and found.error_calibrated < 0.5 * found.error_twin

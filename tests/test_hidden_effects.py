@@ -20,7 +20,7 @@ import pandas as pd
 import pytest
 import same_cause
 from cases import each
-from hidden_cases import NULLS, believed, nothing
+from hidden_cases import NULLS, nominal_twin, nothing
 from hidden_scores import prepared, scores
 from independent_rigs import SYSTEMS, Planted, _moment, modelled, simulate
 
@@ -46,7 +46,7 @@ def test_a_changed_inertia_and_the_planted_load_are_those_of_the_twin(system):
     mujoco.mj_forward(model, data)
     engine = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, engine)
-    twin, name = believed(system), rig.base[0]
+    twin, name = nominal_twin(system), rig.base[0]
     twin = twin.with_parameters(**{name: twin.values[name] + change})
     with jax.enable_x64(True):
         q, v = jnp.asarray(data.qpos), jnp.asarray(data.qvel)
@@ -195,7 +195,7 @@ def told(rows):
 
 
 @hidden
-def test_nothing_is_named_where_nothing_was_hidden_or_what_the_catalogue_does_not_hold(table):
+def test_nothing_is_named_for_nulls_and_for_effects_outside_the_catalogue(table):
     nulls, outside = table[table["kind"].isin(NULLS)], table[table["kind"] == "outside"]
     alarms = nulls[nulls["spoke"]]
     assert len(alarms) <= allowed([0.025] * len(nulls)), told(alarms)
@@ -219,6 +219,6 @@ def test_what_shows_is_found(table):
 
 
 @hidden
-def test_standing_still_says_nothing(table):
+def test_recordings_at_standstill_are_not_identifiable(table):
     still = table[table["kind"] == "still"]
     assert len(still) and (still["verdict"] == "not_identifiable").all(), told(still)

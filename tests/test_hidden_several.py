@@ -1,4 +1,4 @@
-"""Several causes hidden at once: how they are dealt, driven and judged, and what others say."""
+"""Several hidden causes: how cases are drawn, driven and scored, and the answers of others."""
 
 import dataclasses
 
@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import several_rules
 from cases import each
-from hidden_cases import RIGS, believed, kind_of, nothing
+from hidden_cases import RIGS, kind_of, nominal_twin, nothing
 from independent_rigs import EVERYWHERE, Loop, Planted, modelled
 from several_cases import SEVERAL, share_of_friction, visible
-from several_scores import judged
+from several_scores import score_case
 
 from sb3_hds import effects
 from sb3_hds.sysid.checks.timing import in_step_with_the_log
@@ -43,7 +43,7 @@ def test_a_rotor_of_the_engine_is_that_of_the_twin():
     mujoco.mj_forward(model, data)
     engine = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, engine)
-    twin = believed("leg")
+    twin = nominal_twin("leg")
     twin = twin.with_parameters(**{name: twin.values[name] + 0.02})
     with jax.enable_x64(True):
         matrix = twin.mass_matrix(jnp.asarray(data.qpos), twin.params)
@@ -103,7 +103,7 @@ def test_a_late_bus_delays_every_motor_and_friction_has_its_share():
     (dict(sets=[]), [False, False], [], False, False),
 )
 def test_sets_are_judged_cause_by_cause_and_name_by_name(said, named, right, flawless, with_sets):
-    found = judged(
+    found = score_case(
         [VISCOUS, DRY], said.get("visible", [True, True]), said.get("same", {}), said["sets"]
     )
 

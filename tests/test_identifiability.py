@@ -38,7 +38,7 @@ def chance(slopes, gain):
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.95])
-def test_the_best_of_many_passes_as_rarely_as_it_should_where_nothing_is_wrong(colour):
+def test_the_best_of_many_candidates_passes_on_null_data_at_the_nominal_rate(colour):
     rng = np.random.default_rng(0)
     alarms = sum(chance(*linear(rng, colour=colour)) < 0.05 for _ in range(100))
     # Binomial(100, 0.05) is above 12 once in 500 cases. A chi-square test of the best candidate

@@ -95,7 +95,7 @@ def test_a_folder_that_jax_was_given_stays(folder, fresh_settings, monkeypatch, 
     assert jax.config.values["jax_compilation_cache_dir"] == folder
 
 
-def test_where_jax_keeps_nothing_we_do_not_either(fresh_settings, monkeypatch, tmp_path):
+def test_nothing_is_cached_where_jax_caches_nothing(fresh_settings, monkeypatch, tmp_path):
     monkeypatch.setenv("SB3_HDS_CACHE", str(tmp_path))
     jax.config.update("jax_enable_compilation_cache", False)
     try:
@@ -113,7 +113,7 @@ def test_how_long_a_program_must_take_is_the_users_to_say(fresh_settings, monkey
     assert jax.config.values["jax_persistent_cache_min_compile_time_secs"] == 5.0
 
 
-def test_a_jax_that_opens_its_folder_otherwise_keeps_nothing(fresh_settings, monkeypatch, tmp_path):
+def test_with_an_unknown_cache_of_jax_nothing_is_cached(fresh_settings, monkeypatch, tmp_path):
     from jax._src import compilation_cache
 
     monkeypatch.setenv("SB3_HDS_CACHE", str(tmp_path))
@@ -207,7 +207,7 @@ for _ in range(200):
 """
 
 
-def test_processes_that_write_one_program_leave_it_whole(tmp_path):
+def test_processes_that_write_one_program_leave_it_complete(tmp_path):
     command = [sys.executable, "-c", WRITES, str(tmp_path)]
     writers = [subprocess.Popen([*command, letter]) for letter in "ab"]
     programs, seen, path = Programs(tmp_path), set(), None

@@ -81,7 +81,7 @@ def test_a_package_that_fails_says_so_each_time(package):
             _ = module.OWN
 
 
-def test_threads_that_ask_at_the_same_time_find_it_whole(package):
+def test_threads_that_read_at_the_same_time_find_it_complete(package):
     source = INIT.format(name=package.name)
     (package / "__init__.py").write_text(f"import time\n{source}time.sleep(0.3)\nLAST = 2\n")
     postpone(package.name)
@@ -102,7 +102,7 @@ def test_what_is_not_there_is_not_put_there():
     assert "no_such_package_of_that_name" not in sys.modules
 
 
-def test_algorithms_import_what_they_need_and_sbx_stays_whole():
+def test_algorithms_import_only_what_they_need_and_sbx_stays_complete():
     done = subprocess.run([sys.executable, "-c", IMPORTS], text=True, capture_output=True)
 
     assert done.returncode == 0, done.stderr

@@ -97,7 +97,9 @@ def test_a_sign_of_degrees_is_read_in_any_encoding(encoding, tmp_path):
 
 # Doubles of the size of the last ones are 256 ns apart.
 @pytest.mark.parametrize(("unit", "per_second"), [("s", 1), ("ms", 10**3), ("ns", 10**9)])
-def test_dates_of_this_century_are_told_by_their_size_and_not_rounded(unit, per_second, tmp_path):
+def test_time_stamps_since_1970_are_recognised_by_their_size_and_not_rounded(
+    unit, per_second, tmp_path
+):
     step = 10_000 if unit == "ns" else per_second
     rows = [(f"{1_700_000_000 * per_second + step * k}", "0", "0") for k in range(9)]
 
@@ -147,7 +149,7 @@ def test_columns_are_converted_and_a_scale_counts_more_than_a_unit_in_the_file(t
     assert other.obs[0, :, 0].tolist() == [10.0, 20.0]
 
 
-def test_files_that_name_different_units_are_told_apart(tmp_path):
+def test_files_that_name_different_units_are_distinguished(tmp_path):
     (tmp_path / "a.csv").write_text("t,q,u\ns,deg,N\n0,1,0\n1,2,0\n")
     (tmp_path / "b.csv").write_text("t,q,u\n0,1,0\n1,2,0\n")
     with pytest.raises(TrajectoryError, match=r"'q' is in deg in .*obs: \[{column: q, unit: UNIT}"):

@@ -69,7 +69,7 @@ def test_after_the_same_seed_a_model_explores_and_learns_alike():
     ("droq", {"use_sde": True, "train_freq": 1}, "a new noise matrix at each step"),
     ("td7", {"gradient_steps": 2, "use_checkpoints": True}, "does not look at gradient_steps"),
 )
-def test_arguments_that_say_nothing_are_warned_of(name, arguments, message):
+def test_arguments_without_effect_cause_a_warning(name, arguments, message):
     with pytest.warns(UserWarning, match=message):
         small(name, **arguments)
 
@@ -207,7 +207,7 @@ def test_batches_are_normalised_as_the_environment_is_and_time_limits_are_no_end
     assert model.replay_buffer.dones.sum() == 2.0 and not batch.terminated.any()
 
 
-def test_networks_start_afresh_when_told_to():
+def test_networks_are_reset_on_schedule():
     model = small("crossq_jax", param_resets=[20]).learn(15)
     before = model.get_parameters()["policy"]
     model.learn(15, reset_num_timesteps=False)

@@ -52,7 +52,7 @@ def test_errors_are_those_of_the_joints_and_the_still_shows_the_largest(moving):
     assert moving.lines[0].min() >= 0.0 and moving.lines[0].max() <= 100.0
 
 
-def test_a_film_is_written_as_a_whole(moving, tmp_path):
+def test_a_film_is_written_completely_or_not_at_all(moving, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     pytest.importorskip("matplotlib")
 

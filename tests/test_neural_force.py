@@ -75,7 +75,7 @@ def test_it_turns_with_a_hinge_and_is_bounded(x64):
     assert force.disagreement(q, v, u, own) > 0.0
 
 
-def test_caution_makes_disagreement_cost_something():
+def test_caution_adds_disagreement_to_the_cost():
     twin = twins.make("Pendulum")
     bold, careful = (twin.extend(NeuralForce(share=1.0, caution=c)) for c in (0.0, 10.0))
     state, action = twin.initial(jax.random.key(0), twin.params), jnp.array([0.5])

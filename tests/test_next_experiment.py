@@ -194,14 +194,14 @@ def test_commands_are_smooth_enough_for_a_controller(told):
     assert power[frequency > 0.2 / TWIN.dt].sum() < 0.05 * power.sum()
 
 
-def test_late_and_lagging_motors_are_told_apart_and_the_hardest_pair_comes_first(told):
+def test_late_and_lagging_motors_are_distinguished_and_the_hardest_pair_comes_first(told):
     assert told.decides and told.chance > 0.9 and told.needed <= 1.0
     assert [p.ratio for p in told.pairs] == sorted(p.ratio for p in told.pairs)
     assert "told apart" in told.sentence
     assert max(map(len, str(told).splitlines())) <= 80
 
 
-def test_what_is_told_is_plain_data(told):
+def test_the_result_is_plain_data(told):
     plain = json.loads(json.dumps(told.to_dict(), allow_nan=False))
 
     assert plain["commands"] == told.commands.actions.tolist() and plain["decides"] is True
@@ -267,7 +267,7 @@ def test_mass_and_gain_are_one_without_a_force_sensor():
     assert any("sensor of the actuator's force" in words for words in told.would_tell)
 
 
-def test_where_one_pair_cannot_be_told_the_others_are_counted(told):
+def test_where_one_pair_cannot_be_distinguished_the_others_are_counted(told):
     pair = lambda a, b, chance: Pair(a, b, 1.0, chance, 1.0 if chance > 0.5 else np.inf)  # noqa: E731
     pairs = [pair(a, b, 0.0) for a, b in (("mass", "gain"), ("gain", "mass"))]
     pairs += [pair(a, b, 1.0) for x in ("mass", "gain") for a, b in ((x, "lag"), ("lag", x))]
@@ -286,7 +286,7 @@ def test_one_answer_asks_for_narrower_parameters():
     assert told.information == pytest.approx(np.log(now / then), rel=1e-3)
 
 
-def test_limits_that_nothing_keeps_are_said():
+def test_limits_that_the_start_breaks_are_reported():
     with pytest.raises(CalibrationError, match="velocity of hinge is taken to"):
         designed(LATE, LAGGING, start=[1.0, 0.0, 6.0], limits={"velocity": 1.0})
 

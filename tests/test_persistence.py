@@ -164,7 +164,7 @@ def test_parameters_make_a_round_trip_and_misfits_are_refused(name):
         small(name, **other_size).set_parameters(before)
 
 
-def test_a_file_appears_whole_and_a_failed_save_leaves_the_older_one(tmp_path, monkeypatch):
+def test_a_file_appears_complete_and_a_failed_save_leaves_the_older_one(tmp_path, monkeypatch):
     model = small("droq")
     write, seen = th.save, []
 

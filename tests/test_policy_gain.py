@@ -79,7 +79,7 @@ def test_other_algorithms_train_in_the_simulation_for_a_budget():
     assert set(found.returns) == {"believed", "extended"} and found.to_dict()["runs"] == 1
 
 
-def test_it_is_drawn_and_told_in_the_report(measured, tmp_path):
+def test_it_is_plotted_and_described_in_the_report(measured, tmp_path):
     assert measured.plot(tmp_path / "gain.png").stat().st_size > 5_000
     page = a_diagnosis().to_html(tmp_path / "report.html", measured.to_dict()).read_text()
     assert "What it buys" in page and "the extended twin" in page

@@ -32,7 +32,7 @@ def test_what_is_no_belief_is_refused(belief):
         prior_of("mass", MASS, 2.0, belief=belief)
 
 
-def test_noise_is_told_from_a_smooth_motion():
+def test_noise_is_distinguished_from_a_smooth_motion():
     rng, t = np.random.default_rng(0), 0.01 * np.arange(2001)
     obs = np.stack([np.sin(3.0 * t), 3.0 * np.cos(3.0 * t)], 1)
     noisy = obs + rng.standard_normal(obs.shape) * [1e-3, 0.05]
@@ -41,7 +41,7 @@ def test_noise_is_told_from_a_smooth_motion():
     assert noise_of(data) == pytest.approx([1e-3, 0.05], rel=0.1)
 
 
-def test_what_is_far_off_is_told_in_the_unit_of_the_channel_and_in_shares():
+def test_large_deviations_are_reported_in_the_unit_of_the_channel_and_as_shares():
     channels = Channel("angle", "rad"), Channel("speed", "rad/s")
     raw = np.broadcast_to([0.5, 0.02], (4, 10, 2))
     found = distances(channels, raw, np.array([0.01, 0.01]), np.array([1.0, 1.0]))

@@ -74,7 +74,7 @@ def page(crowded, tmp_path_factory):
     return path.read_text()
 
 
-def test_every_reason_to_turn_something_down_is_printed_as_a_whole(rubbing):
+def test_every_reason_for_a_rejection_is_printed_completely(rubbing):
     reasons = ("UNCERTAIN", "SMALL", "CHANCE", "NO_CONSTANT", "NAMELESS", "ANOTHER")
     for why in (getattr(telling, name) for name in reasons):
         rejected = (Rejected("directional_viscous_friction.hinge_velocity", -50.0, math.nan, why),)
@@ -230,7 +230,7 @@ def test_the_report_needs_no_network_and_its_pictures_are_files_too(rubbing, pag
         rubbing.to_html(tmp_path / "r.pdf")
 
 
-def test_data_that_say_nothing_make_a_page_too(rubbing, tmp_path):
+def test_unidentifiable_data_make_a_page_too(rubbing, tmp_path):
     nothing = {"findings": (), "gain": {}, "explained": 0.0, "detectable": {}, "rejected": ()}
     said = {"verdict": "not_identifiable", "caveats": ("The system stands still.",)}
     refused = dataclasses.replace(rubbing, twin=TWIN, pictures=None, **nothing, **said)

@@ -100,7 +100,7 @@ def test_what_a_study_cannot_be_is_refused(changes, why, tmp_path):
         study_of(tmp_path, **changes)
 
 
-def test_the_zoo_is_told_everything(tmp_path):
+def test_the_zoo_command_contains_all_settings(tmp_path):
     study = study_of(tmp_path, budget={"steps": 400, "minutes": 0.5})
 
     words = zoo_command(study)(
@@ -113,7 +113,7 @@ def test_the_zoo_is_told_everything(tmp_path):
     assert words[4] == "0.5" and words[5].endswith("last") and words[6] == "5.0"
 
 
-def test_checkpoints_are_not_less_than_nothing_apart(tmp_path):
+def test_an_interval_between_checkpoints_is_not_negative(tmp_path):
     with pytest.raises(StudyError, match="must be 0 or more, got -1"):
         zoo_command(study_of(tmp_path), -1.0)
 
@@ -166,7 +166,7 @@ def test_a_study_that_is_killed_at_any_moment_goes_on(tmp_path):
     assert ledger.read_text() == before
 
 
-def test_a_failing_run_is_told_and_stops_no_other(tmp_path):
+def test_a_failing_run_is_reported_and_stops_no_other(tmp_path):
     study, said = study_of(tmp_path, algorithms=["fails", "hds"], envs=["Pendulum-v1"]), []
 
     done = run_study(

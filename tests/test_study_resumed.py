@@ -133,7 +133,7 @@ def test_a_node_is_lost_and_no_run_is(cluster, tmp_path):
 
 
 @pytest.mark.expensive
-def test_what_no_node_has_is_refused_and_what_fails_is_told(cluster, tmp_path):
+def test_resources_that_no_node_has_are_refused_and_failures_are_reported(cluster, tmp_path):
     study = study_of(tmp_path, algorithms=["fails", "hds"])
     with pytest.raises(StudyError, match="No node has 64 cores"):
         run_study(study, tmp_path / "logs", ray=cluster.address, cpus=64)

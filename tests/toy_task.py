@@ -1,4 +1,4 @@
-"""A task in which one thing at a time can be made wrong."""
+"""A task in which one property at a time can be made wrong."""
 
 import gymnasium
 import numpy as np

@@ -110,7 +110,7 @@ def _effect_section(effect: type) -> str:
         _parameters(effect.parameters),
     ]
     for other, condition in effect.equivalents.items():
-        parts.append(f"Cannot be told apart from `{other}` {condition}.\n\n")
+        parts.append(f"Cannot be distinguished from `{other}` {condition}.\n\n")
     return "".join(parts)
 
 

@@ -1,12 +1,13 @@
 """
-Fills in what the code knows better than a page.
+Generates parts of pages from the package and from ``benchmarks/results``.
 
-A line ``<!-- generated: NAME -->`` of a page is replaced by Markdown that is made from the package
-as it is now, each time that the page is read.
+A line ``<!-- generated: NAME -->`` of a page is replaced by Markdown, each time that the page is
+read.
 """
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import benchmark_results
@@ -15,10 +16,11 @@ import import_picture
 import reference
 import summaries
 
-# Between which planning in the data sheet's twin and in the true one lie, of the worn pendulum.
+# Table, and its variants at both ends of the gap: planning in the data sheet's twin and in the true
+# one, of the worn pendulum.
 WORN = ("hds_parts", "wrong twin", "ceiling")
 
-# What is shown beside an algorithm on its page.
+# Methods with which the page of an algorithm compares it.
 LEARNED = {
     "hds": ("sac", "sb3_sac", "sbx_sac"),
     "gsde_sac": ("sb3_gsde_sac", "sac", "sb3_sac", "sbx_sac"),
@@ -38,13 +40,17 @@ PARTS: dict[str, Callable[[], str]] = {
     "effects": catalogue.effects_as_markdown,
     "nameless": catalogue.nameless_as_markdown,
     "environments": catalogue.environments_as_markdown,
-    "benchmarks": benchmark_results.as_markdown,
-    "sim_to_real_gap": summaries.whole(
+    "benchmarks": lambda: benchmark_results.as_markdown(pages_by_result()),
+    "pendulum": summaries.complete("pendulum"),
+    "epoch_cost": summaries.complete("epoch_cost", "time and memory of an epoch against rollouts"),
+    "import_time": summaries.complete("import_time"),
+    "qp_solvers": summaries.complete("qp_solvers"),
+    "sim_to_real_gap": summaries.complete(
         "sim_to_real_gap", "share of the gap that is closed, by cell"
     ),
-    "sim_to_real_ahead": summaries.whole("sim_to_real_ahead"),
-    "sim_to_real_median": summaries.whole("sim_to_real_median"),
-    "payload_added": summaries.whole("payload_added_recovery"),
+    "sim_to_real_ahead": summaries.complete("sim_to_real_ahead"),
+    "sim_to_real_median": summaries.complete("sim_to_real_median"),
+    "payload_added": summaries.complete("payload_added_recovery"),
     "ten_minutes": summaries.first_and_rest(
         "ten_minutes", 3, "return of each episode against minutes"
     ),
@@ -57,7 +63,7 @@ PARTS: dict[str, Callable[[], str]] = {
         shows="return with each part switched off, a dot for each seed",
     ),
     "open_loop": summaries.gaits,
-    "open_loop_scores": summaries.whole(
+    "open_loop_scores": summaries.complete(
         "open_loop_scores", "scores of open loop and PPO in each environment and over all of them"
     ),
     "robustness_return": summaries.crossed(
@@ -66,11 +72,11 @@ PARTS: dict[str, Callable[[], str]] = {
     "robustness_share": summaries.crossed(
         "robustness", ("env", "policy"), ("perturbation",), "share"
     ),
-    "action_scale": summaries.whole("action_scale_reached"),
-    "action_scale_short": summaries.whole("action_scale_wheelbase_0.4_reached"),
-    "action_scale_steering": summaries.whole("action_scale_steering_reached"),
-    "action_scale_sharp": summaries.whole("action_scale_steering_wheelbase_0.25_reached"),
-    "action_scale_racing": summaries.whole("action_scale_steering_wheelbase_0.25_sde_reached"),
+    "action_scale": summaries.complete("action_scale_reached"),
+    "action_scale_short": summaries.complete("action_scale_wheelbase_0.4_reached"),
+    "action_scale_steering": summaries.complete("action_scale_steering_reached"),
+    "action_scale_sharp": summaries.complete("action_scale_steering_wheelbase_0.25_reached"),
+    "action_scale_racing": summaries.complete("action_scale_steering_wheelbase_0.25_sde_reached"),
     "safe_swing_up": summaries.over_seeds(
         "safe_swing_up",
         "without",
@@ -87,35 +93,36 @@ PARTS: dict[str, Callable[[], str]] = {
         shows="return after 50,000 steps with each method, a dot for each seed",
     ),
     **{
-        f"hidden_effects_{part}": summaries.whole(f"hidden_effects_{part}")
-        for part in (
-            *("targets", "kinds", "difficulty", "causes", "systems", "outside", "rules"),
-            *("several", "several_conditions", "several_rules"),
-        )
+        f"hidden_effects_{part}": summaries.complete(f"hidden_effects_{part}")
+        for part in ("targets", "kinds", "difficulty", "causes", "systems", "outside", "rules")
+    },
+    **{
+        f"hidden_effects_{part}": summaries.complete(f"hidden_effects_quick_{part}")
+        for part in ("several", "several_conditions", "several_rules")
     },
     "hidden_effects_picture": summaries.picture(
         "hidden_effects", "rates with intervals beside their targets, right names against size"
     ),
-    "policy_gain": summaries.whole("policy_gain_intervals"),
+    "policy_gain": summaries.complete("policy_gain_intervals"),
     "policy_gain_picture": summaries.picture(
         "policy_gain", "return on the real system of policies from each twin, a line for each seed"
     ),
-    "next_experiment_settled": summaries.whole("next_experiment_settled"),
-    "next_experiment_bands": summaries.whole("next_experiment_bands"),
-    "uncertain_verdicts": summaries.whole("uncertain_verdicts_intervals"),
-    "diagnosis_cost": summaries.whole(
+    "next_experiment_settled": summaries.complete("next_experiment_settled"),
+    "next_experiment_bands": summaries.complete("next_experiment_bands"),
+    "uncertain_verdicts": summaries.complete("uncertain_verdicts_intervals"),
+    "diagnosis_cost": summaries.complete(
         "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
     ),
-    "model_files": summaries.whole("model_files"),
-    "joints_cost": summaries.whole("joints_cost"),
-    "cluster_overhead": summaries.whole("cluster_overhead"),
-    "start_up": summaries.whole("start_up_summary"),
-    "diagnosis_cost_lines": summaries.whole("diagnosis_cost_lines"),
+    "model_files": summaries.complete("model_files"),
+    "joints_cost": summaries.complete("joints_cost"),
+    "cluster_overhead": summaries.complete("cluster_overhead"),
+    "start_up": summaries.complete("start_up_summary"),
+    "diagnosis_cost_lines": summaries.complete("diagnosis_cost_lines"),
     **{f"learned_{method}": summaries.learned(method, *peers) for method, peers in LEARNED.items()},
     "learned": summaries.learned(),
-    "learned_papers": summaries.whole("model_free_papers"),
-    "learned_peers": summaries.whole("model_free_peers", digits=4),
-    "learned_fewer_steps": summaries.whole("model_free_fewer_steps"),
+    "learned_papers": summaries.complete("model_free_papers"),
+    "learned_peers": summaries.complete("model_free_peers", digits=4),
+    "learned_fewer_steps": summaries.complete("model_free_fewer_steps"),
     **{
         f"learned_on_{env.partition('-')[0]}": summaries.picture(
             f"model_free_{env}",
@@ -138,14 +145,14 @@ PARTS: dict[str, Callable[[], str]] = {
         "continuity_of_mean",
         shows="return of the mean policy against the continuity cost while learning",
     ),
-    "sb3_tests": summaries.whole("sb3_tests_table"),
-    "speed": summaries.whole("speed_targets"),
-    "speed_on_cuda": summaries.whole("speed_cuda_targets"),
-    "speed_of_sbx_on_cuda": summaries.whole("speed_cuda_sbx_sb3"),
-    "speed_products": summaries.whole("speed_products"),
-    "speed_of_sbx": summaries.whole("speed_sbx_sb3"),
-    "speed_start_up": summaries.whole("speed_start_up"),
-    "speed_alone": summaries.whole("speed_alone"),
+    "sb3_tests": summaries.complete("sb3_tests_table"),
+    "speed": summaries.complete("speed_targets"),
+    "speed_on_cuda": summaries.complete("speed_cuda_targets"),
+    "speed_of_sbx_on_cuda": summaries.complete("speed_cuda_sbx_sb3"),
+    "speed_products": summaries.complete("speed_products"),
+    "speed_of_sbx": summaries.complete("speed_sbx_sb3"),
+    "speed_start_up": summaries.complete("speed_start_up"),
+    "speed_alone": summaries.complete("speed_alone"),
     "hds_weaknesses": summaries.over_seeds(
         "hds_weaknesses",
         "variant",
@@ -165,7 +172,9 @@ PARTS: dict[str, Callable[[], str]] = {
     ),
 }
 
+_DOCS = Path(__file__).parent.parent
 _LINE = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
+_RESULT = re.compile(r"benchmarks/results/([\w.-]+)\.(?:csv|png)")
 
 
 def fill_in(text: str) -> str:
@@ -175,6 +184,18 @@ def fill_in(text: str) -> str:
     :raises KeyError: for a part that does not exist
     """
     return _LINE.sub(lambda line: PARTS[line[1]](), text)
+
+
+def pages_by_result() -> dict[str, list[str]]:
+    """:return: for each table or picture, the pages that show it, relative to a folder of docs"""
+    pages: dict[str, list[str]] = {}
+    for page in sorted([*_DOCS.glob("*.md"), *_DOCS.glob("[!_]*/[!_]*.md")]):
+        text = page.read_text()
+        parts = [PARTS[name] for name in _LINE.findall(text)]
+        shown = [text, *(part() for part in parts if part.__module__ == summaries.__name__)]
+        for name in dict.fromkeys(_RESULT.findall("\n".join(shown))):
+            pages.setdefault(name, []).append(f"../{page.relative_to(_DOCS).as_posix()}")
+    return pages
 
 
 def setup(app: Any) -> dict[str, bool]:

@@ -1,4 +1,4 @@
-"""Tables and pictures of ``benchmarks/results``: as they are, or condensed."""
+"""Tables and pictures of ``benchmarks/results``, complete or condensed."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,12 +20,12 @@ def over_seeds(
 ) -> Callable[[], str]:
     """
     :param name: of the table, without its ending
-    :param variant: column that tells variants apart, or several that do so together
-    :param measured: columns that are shown
-    :param ends: name of a table, and the variants in it between which there is a gap: the share of
-        it that each variant's return closes is shown too, once they have been measured
-    :param shows: what is to be seen on the picture of the same name, if there is one
-    :return: what makes the Markdown
+    :param variant: column that identifies a variant, or several that do so together
+    :param measured: columns to show
+    :param ends: name of a table, and two variants in it: the share of the gap between them that the
+        return of each variant closes is shown too, once both have been measured
+    :param shows: description of the picture of the same name, if there is one
+    :return: function that makes the Markdown
     """
 
     def condensed(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
@@ -36,7 +36,7 @@ def over_seeds(
         lines = []
         for one in dict.fromkeys(map(name_of, rows)):
             own = [row for row in rows if name_of(row) == one]
-            values = [_spread([float(row[i]) for row in own]) for i in shown]
+            values = [_mean_and_range([float(row[i]) for row in own]) for i in shown]
             closed = [_closed(_by_seed(columns, own), gap)] if gap else []
             lines.append([one, *values, *closed, str(len(own))])
         return [", ".join(parts), *measured, *(["closed"] if gap else []), "seeds"], lines
@@ -46,11 +46,10 @@ def over_seeds(
 
 def first_and_rest(name: str, n_first: int, shows: str = "") -> Callable[[], str]:
     """
-    :param name: of a table with a row for each episode: minutes, steps, return, and steps that had
-        come late by then
-    :param n_first: episodes that are shown by themselves
-    :param shows: what is to be seen on the picture of the same name, if there is one
-    :return: what makes the Markdown
+    :param name: of a table with a row for each episode: minutes, steps, return, late steps so far
+    :param n_first: number of episodes that have rows of their own
+    :param shows: description of the picture of the same name, if there is one
+    :return: function that makes the Markdown
     """
 
     def condensed(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
@@ -65,7 +64,7 @@ def first_and_rest(name: str, n_first: int, shows: str = "") -> Callable[[], str
                 [
                     f"{begin + 1}" if end == begin + 1 else f"{begin + 1} to {end}",
                     rounded(own[-1][at["minutes"]]),
-                    _spread([float(row[at["return"]]) for row in own]),
+                    _mean_and_range([float(row[at["return"]]) for row in own]),
                     rounded(late[end] - late[begin]),
                 ]
             )
@@ -74,18 +73,20 @@ def first_and_rest(name: str, n_first: int, shows: str = "") -> Callable[[], str
     return lambda: _shown(name, condensed, shows)
 
 
-def whole(name: str, shows: str = "", digits: int = 3) -> Callable[[], str]:
+def complete(name: str, shows: str = "", digits: int = 3) -> Callable[[], str]:
     """
-    :param name: of a table that is shown as it is, numbers rounded
-    :param shows: what is to be seen on the picture of the same name, if there is one
-    :param digits: of a number
-    :return: what makes the Markdown
+    :param name: of a table that is shown completely, with rounded numbers
+    :param shows: description of the picture of the same name, if there is one
+    :param digits: significant digits of a number
+    :return: function that makes the Markdown
     """
 
-    def as_it_is(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+    def with_rounded_numbers(
+        columns: list[str], rows: list[list[str]]
+    ) -> tuple[list[str], list[list[str]]]:
         return columns, [[rounded(cell, digits) for cell in row] for row in rows]
 
-    return lambda: _shown(name, as_it_is, shows)
+    return lambda: _shown(name, with_rounded_numbers, shows)
 
 
 def crossed(
@@ -93,10 +94,10 @@ def crossed(
 ) -> Callable[[], str]:
     """
     :param name: of the table, without its ending
-    :param row: columns whose entries together are the rows
-    :param columns: columns whose entries together are the columns
-    :param value: column that is shown, the mean over whatever else there is
-    :return: what makes the Markdown
+    :param row: columns whose values become the rows
+    :param columns: columns whose values become the columns
+    :param value: column to show, as the mean over all other columns
+    :return: function that makes the Markdown
     """
 
     def turned(titles: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
@@ -114,7 +115,7 @@ def crossed(
 
 
 def gaits() -> str:
-    """:return: Markdown of what open-loop searches found, by environment and budget"""
+    """:return: Markdown with the results of open-loop searches, by environment and budget"""
 
     def condensed(titles: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
         runs = [dict(zip(titles, row, strict=True)) for row in rows]
@@ -143,9 +144,9 @@ def gaits() -> str:
 
 def learned(*methods: str) -> Callable[[], str]:
     """
-    :param methods: of `model_free.py` that are shown, in this order, in the environments in which
-        the first one or a variant of it was run; none: all
-    :return: what makes the Markdown of how well they learn, by environment
+    :param methods: methods of `model_free.py` to show, in this order, for the environments in which
+        the first one or a variant of it was run; default: all
+    :return: function that makes the Markdown with their returns by environment
     """
 
     def condensed(titles: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
@@ -178,8 +179,8 @@ def _mean(values: list[float]) -> str:
 def picture(name: str, shows: str) -> Callable[[], str]:
     """
     :param name: of the picture, without its ending
-    :param shows: what is to be seen on it
-    :return: what makes the Markdown for a page of a folder of `docs`, once there is a picture
+    :param shows: its description
+    :return: function that makes the Markdown for a page in a folder of `docs`
     """
     there = f"![{shows}](../../benchmarks/results/{name}.png)"
     return lambda: there if (RESULTS / f"{name}.png").exists() else _NONE
@@ -197,7 +198,7 @@ def _shown(name: str, change: Callable, shows: str = "") -> str:
     return shown + f"From `benchmarks/results/{name}.csv`."
 
 
-def _spread(values: list[float]) -> str:
+def _mean_and_range(values: list[float]) -> str:
     mean, low, high = (rounded(x) for x in (fmean(values), min(values), max(values)))
     return mean if low == high else f"{mean} ({low} to {high})"
 
@@ -207,7 +208,7 @@ def _by_seed(columns: list[str], rows: list[list[str]]) -> dict[str, float]:
 
 
 def _gap(name: str, worst: str, best: str, variant: str) -> dict[str, tuple[float, float]]:
-    """:return: both ends of the gap, for the seeds that have been run with both"""
+    """:return: both ends of the gap by seed, for the seeds that were run with both"""
     path = RESULTS / f"{name}.csv"
     if not path.exists():
         return {}
@@ -220,7 +221,7 @@ def _gap(name: str, worst: str, best: str, variant: str) -> dict[str, tuple[floa
 
 
 def _closed(returns: dict[str, float], gap: dict[str, tuple[float, float]]) -> str:
-    """The share over the seeds that both have, as `benchmarks/sim_to_real.py` has it."""
+    """The closed share of the gap over common seeds, computed as in `benchmarks/sim_to_real.py`."""
     seeds = [seed for seed in returns if seed in gap]
     if not seeds:
         return ""

@@ -23,7 +23,7 @@ def read(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def rounded(cell: float | str, digits: int = 3) -> str:
-    """Three digits of a number tell enough, most often; words stay."""
+    """Round a number to three significant digits; other text is unchanged."""
     try:
         number = float(cell)
     except ValueError:
