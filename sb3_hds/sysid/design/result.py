@@ -187,9 +187,14 @@ class NextExperiment:
 
         :param path: of the picture, for example ``"next.png"``
         """
-        from sb3_hds.sysid.design.plots import plot_next
+        self.figure().savefig(path, dpi=150)
 
-        plot_next(self).savefig(path, dpi=150)
+    def figure(self, narrow: bool = False) -> Any:
+        """:return: the same as a figure of matplotlib, for a narrow page or a wide one"""
+        from sb3_hds.sysid.reporting.figures import plot_next
+
+        own = (self.predicted, self.answers, self.channels, self.actuators)
+        return plot_next(self.commands, *own, narrow=narrow)
 
 
 def check_file(path: str | os.PathLike[str]) -> None:

@@ -16,11 +16,25 @@ from sb3_hds.core.twin import plant_of
 from sb3_hds.sysid.reporting.pictures import Replay
 from sb3_hds.twins import MechanismTwin
 
-#: who moves: label and colour, the widest first
+
+class Player(NamedTuple):
+    """
+    A motion on the stage.
+
+    :param width: of its capsules, in units of :attr:`Moving.width`
+    """
+
+    label: str
+    colour: str
+    width: float
+    opacity: float
+
+
+#: the motions that are drawn, the widest first
 PLAYERS = (
-    ("measured", "#a9a59a"),
-    ("predicted by the model as it came", "#d1495b"),
-    ("predicted by the corrected model", "#27496d"),
+    Player("measured", "#a9a59a", 1.6, 1.0),
+    Player("predicted by the model as it came", "#d1495b", 1.0, 0.8),
+    Player("predicted by the corrected model", "#27496d", 0.6, 0.9),
 )
 # Frames that a page holds at most, and joints whose errors it shows.
 _MOST_FRAMES, _MOST_JOINTS = 400, 12
@@ -58,8 +72,32 @@ class Moving(NamedTuple):
         gap = np.abs(self.lines[1] - self.lines[2]).reshape(len(self.time), -1)
         return int(np.argmax(np.nan_to_num(gap).max(1)))
 
-    def to_json(self) -> str:
-        """:return: for a page: rounded to what can be seen"""
+    def section(self) -> dict[str, Any]:
+        """:return: what the template ``moving.html`` shows: a still, and all frames for scripts"""
+        still = self.still
+        share = 100.0 * self.time / (self.time[-1] or 1.0)
+        players = [
+            player._asdict()
+            | {
+                "width": self.width * player.width,
+                "lines": np.nan_to_num(lines[still]).reshape(-1, 4),
+                "outlines": [np.nan_to_num(corners).ravel() for corners in outlines[still]],
+            }
+            for player, lines, outlines in zip(PLAYERS, self.lines, self.outlines, strict=True)
+        ]
+        return {
+            "still": still,
+            "time": f"{self.time[still]:.2f}",
+            "cursor": f"{share[still]:.1f}",
+            "players": players,
+            "charts": [
+                _chart(name, self.errors[:, :, j], share) for j, name in enumerate(self.names)
+            ],
+            "json": self._to_json(),
+        }
+
+    def _to_json(self) -> str:
+        """All frames, rounded to what can be seen."""
         plain = {
             "time": _numbers(self.time, 3),
             "lines": [[_numbers(frame, 1) for frame in player] for player in self.lines],
@@ -70,6 +108,19 @@ class Moving(NamedTuple):
             "still": self.still,
         }
         return json.dumps(plain, allow_nan=False, separators=(",", ":"))
+
+
+def _chart(label: str, errors: np.ndarray, share: np.ndarray) -> dict[str, Any]:
+    """Errors of a joint against time, both predictions on one scale."""
+    finite = np.abs(errors[np.isfinite(errors)])
+    most = float(np.quantile(finite, 0.98)) if len(finite) else 0.0
+    curves = []
+    for values, player in zip(errors, PLAYERS[1:], strict=True):
+        y = 16.0 - 14.0 * np.clip(np.nan_to_num(values) / (most or 1.0), -1.1, 1.1)
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(share, y, strict=True))
+        curves.append((player.colour, points))
+    name, _, unit = label.partition(" [")
+    return {"name": name, "unit": unit.rstrip("]"), "most": most, "curves": curves}
 
 
 def moving_of(believed: Twin, extended: Twin, replay: Replay) -> Moving:
@@ -86,7 +137,8 @@ def moving_of(believed: Twin, extended: Twin, replay: Replay) -> Moving:
         for twin, obs in zip((believed, believed, extended), seen, strict=True)
     ]
     ends, joints, meshes = (np.stack(parts) for parts in zip(*found, strict=True))
-    seen_from = ends[..., [0, 2]] if not _is_solid(believed) else _projected(ends)
+    solid = isinstance(plant_of(believed), MechanismTwin)
+    seen_from = _projected(ends) if solid else ends[..., [0, 2]]
     outlines = _outlines(_projected(meshes))
     frame = _frame_of(np.concatenate([part[0].reshape(-1, 2) for part in (seen_from, outlines)]))
     names = tuple(f"{joint.name} [{joint.unit}]" for joint in believed.joints)
@@ -122,10 +174,6 @@ def _poses(
         return jnp.stack([flat[:-1], flat[1:]], 1), twin.coordinates(state.q), bare
 
     return jax.vmap(one)(obs)
-
-
-def _is_solid(twin: Twin) -> bool:
-    return isinstance(plant_of(twin), MechanismTwin)
 
 
 def _projected(ends: np.ndarray) -> np.ndarray:
