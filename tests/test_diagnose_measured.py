@@ -12,7 +12,8 @@ from sb3_hds.core import rollout
 from sb3_hds.sysid.estimation.calibrate import spread_of
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
-from sb3_hds.sysid.estimation.shooting import motion_of, shots_of
+from sb3_hds.sysid.estimation.shooting import shots_of
+from sb3_hds.sysid.motion.joints import motion_of
 
 pytestmark = [
     pytest.mark.measured,

@@ -11,14 +11,15 @@ from sb3_hds import Trajectories, diagnose, effects, twins
 from sb3_hds.core import rollout
 from sb3_hds.sysid.checks.conventions import other_convention
 from sb3_hds.sysid.checks.timing import in_step_with_the_log
-from sb3_hds.sysid.equation.columns import equation
+from sb3_hds.sysid.equation.assembly import equation
 from sb3_hds.sysid.equation.effect_columns import lasting
-from sb3_hds.sysid.equation.motion import differences, kinematics, motion
 from sb3_hds.sysid.equation.screening import screen
-from sb3_hds.sysid.equation.smoothing import smooth, white_noise
 from sb3_hds.sysid.equation.terms import effective_inertia, terms
 from sb3_hds.sysid.equation.weak_form import weak_rows
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.motion.joints import differences, kinematics
+from sb3_hds.sysid.motion.motion import motion
+from sb3_hds.sysid.motion.smoothing import smooth, white_noise
 
 
 def proposed(twin, data, calibrate=()):

@@ -18,8 +18,8 @@ from several_scores import judged
 
 from sb3_hds import effects
 from sb3_hds.sysid.checks.timing import in_step_with_the_log
-from sb3_hds.sysid.equation.motion import motion
 from sb3_hds.sysid.equation.screening import screen
+from sb3_hds.sysid.motion.motion import motion
 
 VISCOUS, DRY = "viscous_friction.axis", "coulomb_friction.axis"
 

@@ -12,11 +12,10 @@ import numpy as np
 from sb3_hds.core import AnalyticTwin, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ConstantForce, CoulombFriction, ViscousFriction
-from sb3_hds.sysid.equation.columns import equation
-from sb3_hds.sysid.equation.motion import Motion, Moved
-from sb3_hds.sysid.equation.screening import problem
+from sb3_hds.sysid.equation.assembly import equation, problem
 from sb3_hds.sysid.equation.weak_form import grams, weak_rows
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.motion.motion import Motion, Moved
 
 # What nearly every machine has, whatever is wrong with its log.
 _ALWAYS = (ViscousFriction, CoulombFriction, ConstantForce)

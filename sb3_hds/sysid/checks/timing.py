@@ -20,8 +20,8 @@ from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.data.audit.results import shifted
 from sb3_hds.data.audit.velocity import Lag, lags_of
 from sb3_hds.sysid.checks.conventions import what_friction_leaves
-from sb3_hds.sysid.equation.motion import joint_motion, kinematics, lag_of, motion
-from sb3_hds.sysid.estimation.candidates import encoders
+from sb3_hds.sysid.motion.joints import encoders, joint_motion, kinematics, lag_of
+from sb3_hds.sysid.motion.motion import motion
 
 # Longest shift that is taken for a matter of computation [samples], [s], and the least that counts.
 _SAMPLES, _SECONDS, _VISIBLE = 1.0, 2e-3, 0.1

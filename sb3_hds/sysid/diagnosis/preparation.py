@@ -21,7 +21,6 @@ from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import Split, split
 from sb3_hds.sysid.comparison.scales import sized
 from sb3_hds.sysid.diagnosis.progress import Bar
-from sb3_hds.sysid.equation.motion import Motion, motion
 from sb3_hds.sysid.equation.screening import SMALL_MACHINE, Screened, screen
 from sb3_hds.sysid.equation.terms import terms
 from sb3_hds.sysid.estimation.calibrate import spread_of
@@ -29,6 +28,7 @@ from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.parameters import Belief
 from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
+from sb3_hds.sysid.motion.motion import Motion, motion
 
 # Length of a window in periods of the motion, within these numbers of steps; it is half as long
 # where there would be fewer windows than that.

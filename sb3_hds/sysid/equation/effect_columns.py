@@ -18,8 +18,9 @@ from sb3_hds.effects import SensorDelay
 from sb3_hds.effects.joint import DryFriction
 from sb3_hds.sysid.equation.regression import STEP, Equation, Item, Rows, put, put_acting, ranges_of
 from sb3_hds.sysid.equation.terms import forces, portions, terms
-from sb3_hds.sysid.estimation.candidates import Candidate, encoders
+from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.motion.joints import encoders
 
 # Places of a normal distribution, in standard deviations, and their weights (Gauss-Hermite).
 _PLACES, _WEIGHTS = np.array([0.0, -np.sqrt(3.0), np.sqrt(3.0)]), np.array([4.0, 1.0, 1.0]) / 6.0

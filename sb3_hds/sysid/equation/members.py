@@ -1,6 +1,6 @@
-"""The members of a set with their sizes, intervals and alternatives."""
+"""The members of a set: sizes, intervals, alternatives, and friction against velocity."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,8 +8,9 @@ import scipy
 
 from sb3_hds.core import Effect
 from sb3_hds.sysid.equation.confirmation import equals, worth
+from sb3_hds.sysid.equation.plausibility import plausibility
 from sb3_hds.sysid.equation.problem import Problem, Solution
-from sb3_hds.sysid.equation.regression import Item
+from sb3_hds.sysid.equation.regression import Equation, Item
 
 _CONFIDENCE = 0.9
 # By how much intervals are wider than cluster-robust standard errors make them: a set is hardly
@@ -19,6 +20,10 @@ _INCOMPLETE = 2.0
 # Sets with one more member that count in intervals, at most, and those that are tried; and those in
 # which something else is in the place of a member.
 _MORE_SETS, _TRIED_SETS, _SWAPPED = 12, 60, 4
+
+# Groups of intervals of similar velocity, and the fewest intervals of a group.
+_GROUPS, _LEAST = 48, 5
+_FAMILIES = ("viscous", "dry", "drag")
 
 
 class Member(NamedTuple):
@@ -184,3 +189,81 @@ def _covariance(p: Problem, keys: Sequence[int], found: Solution) -> np.ndarray:
     robust *= n / max(n - len(found.free) / max(p.dof, 1), n / 2)
     own = np.eye(len(found.free), dtype=bool)
     return np.where(own, np.maximum(robust, found.inverse), robust)
+
+
+class ByVelocity(NamedTuple):
+    """
+    The equation of one joint, averaged over intervals of similar velocity.
+
+    :param velocity: mean of each group, ascending, shape ``(groups,)``
+    :param forces: mean of what each column adds, and of the missing force, shape
+        ``(groups, used + 1)``
+    :param used: indices of the columns
+    """
+
+    velocity: np.ndarray
+    forces: np.ndarray
+    used: np.ndarray
+
+
+class FrictionCurve(NamedTuple):
+    """
+    Resistance of a joint against its velocity.
+
+    :param joint: index
+    :param velocity: of groups of intervals, ascending, shape ``(groups,)`` [rad/s] or [m/s]
+    :param measured: mean resistance of each group, with all other causes taken off [N m] or [N]
+    :param found: mean of the friction that was named, likewise
+    """
+
+    joint: int
+    velocity: np.ndarray
+    measured: np.ndarray
+    found: np.ndarray
+
+
+def by_velocity(equation: Equation) -> tuple[ByVelocity, ...]:
+    """:return: of each joint"""
+    return tuple(_of_joint(equation, j) for j in range(equation.missing.shape[1]))
+
+
+def _of_joint(equation: Equation, j: int) -> ByVelocity:
+    pairs = [(i, values) for i, c in enumerate(equation.columns) if (values := c.at(j)) is not None]
+    order = np.argsort(equation.v[:, j], kind="stable")
+    n = max(min(_GROUPS, len(order) // _LEAST), 1)
+    begins = np.arange(n) * len(order) // n
+    sizes = np.diff(begins, append=len(order))
+    mean = lambda values: np.add.reduceat(values[order], begins) / sizes  # noqa: E731
+    forces = [mean(values) for values in (*(v for _, v in pairs), equation.missing[:, j])]
+    return ByVelocity(
+        mean(equation.v[:, j]), np.stack(forces, 1), np.array([i for i, _ in pairs], int)
+    )
+
+
+def friction_curves(
+    p: Problem, groups: Sequence[ByVelocity], items: Sequence[int]
+) -> tuple[FrictionCurve, ...]:
+    """
+    :param groups: the equation of each joint, averaged
+    :param items: of a set of causes
+    :return: of each joint with friction in the set
+    """
+    found = p.solve(items)
+    own = [i for i in items if _is_friction(p, i)]
+    curves = []
+    for j in sorted({int(p.items[i].candidate.index) for i in own}):
+        columns = {c for i in own if p.items[i].candidate.index == j for c in p.items[i].columns}
+        curves.append(_curve(j, groups[j], found.weights, columns))
+    return tuple(curves)
+
+
+def _is_friction(p: Problem, i: int) -> bool:
+    candidate = p.items[i].candidate
+    return candidate.slot == "joint" and plausibility(candidate.name).family in _FAMILIES
+
+
+def _curve(j: int, own: ByVelocity, weights: np.ndarray, columns: Collection[int]) -> FrictionCurve:
+    left = own.forces @ weights[[*own.used, -1]]
+    inside = np.isin(own.used, list(columns))
+    found = own.forces[:, :-1][:, inside] @ weights[own.used[inside]]
+    return FrictionCurve(j, own.velocity, found - left, found)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from sb3_hds.core import Twin
 from sb3_hds.sysid.estimation.candidates import Candidate
+from sb3_hds.sysid.motion.motion import SET_POINTS
 
 
 class Plausibility(NamedTuple):
@@ -70,9 +71,6 @@ _UNKNOWN = Plausibility("", 3.0)
 # A set point is a number that arrives as it is, or late: no amplifier changes it.
 _SET_POINT = 3.0
 _OF_AMPLIFIERS = ("torque_gain", "directional_gain", "dead_zone", "saturation")
-
-#: units of commands that are targets of a servo
-SET_POINTS = ("rad", "rad/s", "m", "m/s", "deg", "deg/s")
 
 
 def plausibility(effect: str) -> Plausibility:

@@ -8,8 +8,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from sb3_hds.core import Effect, Ranges
-from sb3_hds.sysid.equation.motion import Motion
 from sb3_hds.sysid.estimation.candidates import Candidate
+from sb3_hds.sysid.motion.motion import Motion
 
 #: Added to sizes that columns are divided by; its square is not zero.
 TINY = 1e-100

@@ -13,10 +13,10 @@ from sb3_hds.core.numerics.kept_programs import keep_programs
 from sb3_hds.core.trajectories.episodes import same_interval
 from sb3_hds.data.resampling.report import Reading
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.estimation.covariance import Spread, covariance_of
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.inverse_dynamics import NO_THRESHOLD, Forces, by_inverse_dynamics
+from sb3_hds.sysid.estimation.normal_equations import Spread, covariance_of
 from sb3_hds.sysid.estimation.parameters import Free, free_names, one_each, own_values, tie
 from sb3_hds.sysid.estimation.results import Estimate, Fit
 from sb3_hds.sysid.estimation.shooting import Shots, n_free, shots_of

@@ -2,11 +2,9 @@
 
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from sb3_hds.core import ActionEffect, Effect, ExtendedTwin, ForceEffect, SensorEffect, Twin
 from sb3_hds.core.twin import layers_of, plant_of
@@ -20,6 +18,7 @@ from sb3_hds.effects import (
     reversed_joint,
 )
 from sb3_hds.errors import EffectError
+from sb3_hds.sysid.motion.joints import encoders
 
 # Longest delay, in periods of the motion, and the speed below which dry friction is smoothed, in
 # root mean square ones.
@@ -171,51 +170,6 @@ def _of_encoders(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]
             found.append(
                 dataclasses.replace(first, slot="joint", place=place, index=j, parameters=names)
             )
-    return found
-
-
-class Encoder(NamedTuple):
-    """
-    :param position: index of the channel that reports a joint's position
-    :param velocity: of the one that reports its velocity; None if there is none
-    """
-
-    position: int
-    velocity: int | None
-
-    @property
-    def channels(self) -> tuple[int, ...]:
-        """Indices of all channels that it feeds."""
-        return (self.position,) if self.velocity is None else (self.position, self.velocity)
-
-
-def encoders(twin: Twin) -> dict[int, Encoder]:
-    """:return: by joint, where channels are positions and velocities themselves"""
-    twin = plant_of(twin)
-    dof = len(twin.joints)
-    state = twin.initial(jax.random.key(0), twin.params)
-    if state.q.shape != (dof,):
-        return {}
-
-    def seen(x: jax.Array) -> jax.Array:
-        return twin.observe(state._replace(q=x[:dof], v=x[dof:]), twin.params)
-
-    here = jnp.concatenate([0.3 + 0.1 * jnp.arange(dof), 0.7 - 0.1 * jnp.arange(dof)])
-    slopes, values = np.asarray(jax.jacfwd(seen)(here)), np.asarray(seen(here))
-    unit = np.abs(np.abs(slopes).sum(1) - 1.0) < 1e-6
-    found = {}
-    for j in range(dof):
-        places = [
-            [
-                i
-                for i in np.flatnonzero(unit)
-                if np.isclose(slopes[i, k], 1.0) and np.isclose(values[i], here[k], atol=1e-5)
-            ]
-            for k in (j, dof + j)
-        ]
-        if len(places[0]) == 1 and len(places[1]) <= 1:
-            velocity = int(places[1][0]) if places[1] else None
-            found[j] = Encoder(int(places[0][0]), velocity)
     return found
 
 

@@ -25,13 +25,8 @@ from sb3_hds.sysid.estimation.normal_equations import (
     eliminate_starts,
     normal_equations,
 )
-from sb3_hds.sysid.estimation.shooting import (
-    Shots,
-    first_offsets,
-    n_steps_of,
-    simulate,
-    with_slopes,
-)
+from sb3_hds.sysid.estimation.shooting import Shots, n_steps_of, simulate, with_slopes
+from sb3_hds.sysid.motion.joints import first_offsets
 
 # Beyond this, in units of the noise, an error counts in proportion, not by its square.
 _HUBER = 3.0

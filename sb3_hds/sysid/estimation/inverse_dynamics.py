@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 
 from sb3_hds.core import AnalyticTwin, State, Trajectories, Twin
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
-from sb3_hds.sysid.equation.motion import motion
 from sb3_hds.sysid.estimation.parameters import one_each
+from sb3_hds.sysid.motion.motion import motion
 
 # Gauss-Newton steps: most parameters are linear, and need one; Huber's weights need a few.
 _STEPS = 6

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from sb3_hds.sysid.comparison.halves import NOT_FINITE, Half
 from sb3_hds.sysid.comparison.unexplained import MissingForce
-from sb3_hds.sysid.equation.friction import FrictionCurve
+from sb3_hds.sysid.equation.members import FrictionCurve
 from sb3_hds.sysid.estimation.evidence import Point
 
 # Of a normal distribution, 90 % lie within so many standard deviations.

@@ -1,4 +1,6 @@
-"""Regressor columns: what each candidate adds to the equation of motion, linear in its size."""
+"""From candidates and measured motion to the regression problem in which sets are selected."""
+
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -13,14 +15,26 @@ from sb3_hds.sysid.equation.effect_columns import (
     add_sensor,
     nodes_of,
 )
-from sb3_hds.sysid.equation.motion import Motion
+from sb3_hds.sysid.equation.plausibility import plausibility, rarity_of
+from sb3_hds.sysid.equation.problem import Problem
 from sb3_hds.sysid.equation.regression import STEP, Equation, Item, Rows, put
+from sb3_hds.sysid.equation.selection import LATE
 from sb3_hds.sysid.equation.terms import effective_inertia, terms
-from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate, encoders
+from sb3_hds.sysid.equation.weak_form import Grams
+from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.motion.joints import encoders
+from sb3_hds.sysid.motion.motion import Motion
 
 # Columns below this share of the typical force change nothing.
 _NOTHING = 1e-9
+# Share of an interval below which a command is not late: how the motion goes on between two samples
+# matters as much.
+_LEAST_LATE = 0.03
+# Ranges of the motion by which a spring may rest outside of it: farther away, it is an offset.
+_BEYOND = 0.5
+# Least noise of a velocity, in shares of the fastest joint's speed.
+_QUIETEST = 1e-6
 
 
 def equation(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equation:
@@ -153,3 +167,107 @@ def _add_parameter(
     drive = np.divide(drive, power, out=np.zeros_like(drive), where=power > 0.0)
     if np.abs(drive).max() > 0.0:
         made.drives[candidate.key] = drive
+
+
+# ------------------------------------------------------------------------------ the problem
+def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
+    """:param made: normal equations of the equation"""
+    items, n = tuple(equation.items), len(equation.columns)
+    lower, upper, prior = np.full(n, -np.inf), np.full(n, np.inf), np.zeros(n + 1)
+    always = []
+    for number, item in enumerate(items):
+        if item.candidate.slot == PARAMETER and item.candidate.index < 0:
+            always.append(number)
+        for c, name in zip(item.columns, item.names, strict=True):
+            if item.rule == "chain":
+                lower[c], upper[c] = 0.0, 1.0
+            elif item.rule == "linear":
+                lower[c], upper[c] = _bounds(hypotheses, item, name)
+    for number in always:
+        (column,), name = items[number].columns, items[number].candidate.place
+        prior[column] = hypotheses.prior[hypotheses.names.index(name)] ** -2.0
+    dof = equation.missing.shape[1]
+    shares = np.zeros((dof, n))
+    for c, column in enumerate(equation.columns):
+        own = slice(None) if column.joint is None else column.joint
+        shares[own, c] = np.sqrt(np.mean(column.values**2, axis=0))
+    force = np.sqrt(np.mean(equation.actuator**2, axis=0))
+    force = np.maximum(force, np.sqrt(np.mean(equation.load**2, axis=0))) + 1e-300
+    some = np.linspace(0, len(equation.mass) - 1, min(32, len(equation.mass))).astype(int)
+    total = made.by_joint.sum(0)
+    return Problem(
+        items=items,
+        grams=made,
+        lower=lower,
+        upper=upper,
+        prior=prior,
+        force=force,
+        shares=shares,
+        passes=_passing(hypotheses, equation, items),
+        mass=equation.mass[some],
+        effective=equation.effective[some],
+        noise=np.maximum(equation.motion.noise_v, _QUIETEST * equation.motion.speed.max()),
+        noisy=equation.noisy,
+        slopes={key: slope[some] for key, slope in equation.slopes.items()},
+        drives=equation.drives,
+        rests=_rests(equation, items),
+        least=_least_late(equation, items),
+        always=tuple(always),
+        rarity=tuple(rarity_of(item.candidate, hypotheses.believed) for item in items),
+        total=total,
+        cost=float(np.log(made.effective.mean())),
+    )
+
+
+def _rests(equation: Equation, items: Sequence[Item]) -> dict[int, tuple[float, float]]:
+    """Of springs, between which shares of both columns one rests near where the joint moves."""
+    found = {}
+    for number, item in enumerate(items):
+        if item.candidate.name != "stiffness" or item.rule != "blend":
+            continue
+        q = equation.q[:, item.candidate.index]
+        beyond = _BEYOND * float(np.ptp(q))
+        first, second = (at["q0"] for at in item.settings)
+        ends = (float(q.min()) - beyond, float(q.max()) + beyond)
+        low, high = ((end - first) / (second - first) for end in ends)
+        found[number] = (low, high)
+    return found
+
+
+def _least_late(equation: Equation, items: Sequence[Item]) -> dict[int, float]:
+    found = {}
+    for number, item in enumerate(items):
+        if item.candidate.name in LATE:
+            low, high = (at[name] for at, name in zip(item.settings, item.names, strict=True))
+            found[number] = max((_LEAST_LATE * equation.motion.dt - low) / (high - low), 0.0)
+    return found
+
+
+def _bounds(h: Hypotheses, item: Item, name: str) -> tuple[float, float]:
+    """Of a change from the null: what physics allows, and what machines have."""
+    known = plausibility(item.candidate.name)
+    if item.candidate.slot == PARAMETER:
+        place = item.candidate.place
+        i = h.names.index(place)
+        value = h.believed.values[place]
+        return h.lower[i] - value, h.upper[i] - value
+    full = next(p for p in item.candidate.parameters if p.rpartition(".")[2] == name)
+    i = h.names.index(full)
+    low, high = h.lower[i] - h.null[i], h.upper[i] - h.null[i]
+    return max(low, known.lower if known.lower != 0.0 else low), min(high, known.upper)
+
+
+def _passing(h: Hypotheses, equation: Equation, items: Sequence[Item]) -> dict[int, float]:
+    found = {}
+    commands = np.concatenate([r.actions for r in equation.motion.recordings])
+    for number, item in enumerate(items):
+        if item.candidate.name not in ("saturation", "dead_zone"):
+            continue
+        effect = h.effect_of(item.candidate)
+        assert isinstance(effect, ActionEffect)
+        low, high = (at[effect.chained] for at in item.settings)
+        size = np.abs(commands[:, item.candidate.index])
+        middle = 0.5 * (low + high)
+        passing = size < middle if item.candidate.name == "saturation" else size > 0.5 * middle
+        found[number] = float(np.mean(passing))
+    return found
