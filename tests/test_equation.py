@@ -120,7 +120,7 @@ def test_bumps_are_wide_where_velocities_are_noisy_and_narrow_where_something_el
         pull = lambda q, v: -3.0 * v + unknown * np.sin(6.0 * q)  # noqa: E731
         twin, data = rubbing_axis(noise=noise, pull=pull)
         known = Hypotheses.about(twin, (effects.ViscousFriction, effects.CoulombFriction), ())
-        [rows] = weak_rows(equation(known, motion(twin, data)))
+        rows = weak_rows(equation(known, motion(twin, data)), 0)
         return rows.narrowed
 
     assert narrowed(unknown=0.0, noise=1.0) == 1.0

@@ -5,6 +5,7 @@ tried before any cause: a wrong one is imitated by several right ones.
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,6 @@ from sb3_hds.core import AnalyticTwin, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ConstantForce, CoulombFriction, ViscousFriction
 from sb3_hds.sysid.equation.assembly import equation, problem
-from sb3_hds.sysid.equation.weak_form import grams, weak_rows
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.motion.motion import Motion, Moved
 
@@ -43,13 +43,23 @@ class Convention(NamedTuple):
 
 
 class _Change(NamedTuple):
+    """
+    Another convention in which a log may be written.
+
+    :param words: sentences on what differs, and on what to write into the map of columns
+    :param q: what the positions become
+    :param slopes: what velocities and accelerations become
+    :param actions: what the commands become
+    :param scale: of each joint's units, or of all
+    """
+
     name: str
     places: tuple[str, ...]
     words: str
-    q: Callable[[np.ndarray], np.ndarray]
-    slopes: Callable[[np.ndarray], np.ndarray]
-    actions: Callable[[np.ndarray], np.ndarray]
-    scale: np.ndarray
+    q: Callable[[np.ndarray], np.ndarray] = np.asarray
+    slopes: Callable[[np.ndarray], np.ndarray] = np.asarray
+    actions: Callable[[np.ndarray], np.ndarray] = np.asarray
+    scale: np.ndarray | float = 1.0
 
 
 def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Convention | None:
@@ -70,7 +80,7 @@ def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Co
     weight, now = _left(hypotheses, motion)
     if np.all(now < _FINE):
         return None
-    changes = list(_changes(twin, motion))
+    changes = list(_changes(twin))
     if (few := _fewer(motion, _FEW_ROWS)) is not motion:
         likely = _by_gain(hypotheses, few, changes, *_left(hypotheses, few))[:_LIKELIEST]
         changes = [change for _, change, _ in likely]
@@ -124,7 +134,7 @@ def _keys(twin: Twin) -> set[str]:
 def _left(hypotheses: Hypotheses, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """:return: independent rows, and what is left in units of the noise, of each joint"""
     made = equation(hypotheses, motion, quick=True)
-    p = problem(hypotheses, made, grams(made, weak_rows(made)))
+    p = problem(hypotheses, made)
     keys = list(range(len(p.items)))
     found = p.solve(keys)
     rss = p.by_joint(found.weights, p.grams.by_joint)
@@ -132,110 +142,59 @@ def _left(hypotheses: Hypotheses, motion: Motion) -> tuple[np.ndarray, np.ndarra
     return p.grams.effective, np.sqrt(rss / p.grams.effective) / floor
 
 
-def _changes(twin: Twin, motion: Motion) -> Iterator[_Change]:
-    dof, n_act = len(twin.joints), len(twin.actuators)
-    same = lambda x: x  # noqa: E731
-    one = np.ones(dof)
-    names = [joint.name for joint in twin.joints]
-    rotary = np.array([joint.unit == "rad" for joint in twin.joints])
+def _changes(twin: Twin) -> Iterator[_Change]:
+    joints, actuators = twin.joints, twin.actuators
+    dof, n_act = len(joints), len(actuators)
+    rotary = np.array([joint.unit == "rad" for joint in joints])
     for j in np.flatnonzero(rotary):
-        ahead = np.pi * np.eye(dof)[j]
-        yield _Change(
-            "zero",
-            (names[j],),
-            f"{names[j]} is counted from a zero that is half a turn from the model's: write its "
-            "column with offset: 3.14159265, or give the model that zero.",
-            lambda q, ahead=ahead: q + ahead,
-            same,
-            same,
-            one,
+        name = joints[j].name
+        words = (
+            f"{name} is counted from a zero that is half a turn from the model's: write its column "
+            "with offset: 3.14159265, or give the model that zero."
         )
-    for j in range(dof):
-        side = one - 2.0 * np.eye(dof)[j]
-        yield _Change(
-            "direction",
-            (names[j],),
-            f"{names[j]} is counted the other way round: write its columns with scale: -1.",
-            lambda q, side=side: q * side,
-            lambda x, side=side: x * side,
-            same,
-            one,
-        )
-    for i in range(n_act):
-        side = np.ones(n_act) - 2.0 * np.eye(n_act)[i]
-        yield _Change(
-            "command",
-            (twin.actuators[i].name,),
-            f"The command {twin.actuators[i].name} has the wrong sign: write its column with "
-            "scale: -1.",
-            same,
-            same,
-            lambda u, side=side: u * side,
-            one,
-        )
+        yield _Change("zero", (name,), words, q=partial(np.add, np.pi * np.eye(dof)[j]))
+    for j, joint in enumerate(joints):
+        turned = partial(np.multiply, 1.0 - 2.0 * np.eye(dof)[j])
+        words = f"{joint.name} is counted the other way round: write its columns with scale: -1."
+        yield _Change("direction", (joint.name,), words, q=turned, slopes=turned)
+    for i, actuator in enumerate(actuators):
+        turned = partial(np.multiply, 1.0 - 2.0 * np.eye(n_act)[i])
+        words = f"The command {actuator.name} has the wrong sign: write its column with scale: -1."
+        yield _Change("command", (actuator.name,), words, actions=turned)
     if n_act > 1:
-        yield _Change(
-            "command",
-            (),
-            "All commands have the wrong sign: write their columns with scale: -1.",
-            same,
-            same,
-            lambda u: -u,
-            one,
-        )
+        words = "All commands have the wrong sign: write their columns with scale: -1."
+        yield _Change("command", (), words, actions=np.negative)
     if rotary.any():
         size = np.where(rotary, np.pi / 180.0, 1.0)
-        yield _Change(
-            "degrees",
-            (),
-            "Angles are in degrees: write their columns with unit: deg.",
-            lambda q: q * size,
-            lambda x: x * size,
-            same,
-            size,
-        )
+        smaller = partial(np.multiply, size)
+        words = "Angles are in degrees: write their columns with unit: deg."
+        yield _Change("degrees", (), words, q=smaller, slopes=smaller, scale=size)
     for i, j in itertools.combinations(range(dof), 2):
-        if twin.joints[i].unit != twin.joints[j].unit:
-            continue
-        order = np.arange(dof)
-        order[[i, j]] = j, i
-        yield _Change(
-            "order",
-            (names[i], names[j]),
-            f"The columns of {names[i]} and {names[j]} are exchanged: exchange them in the map.",
-            lambda q, order=order: q[:, order],
-            lambda x, order=order: x[:, order],
-            same,
-            one,
-        )
+        if joints[i].unit == joints[j].unit:
+            one, other = joints[i].name, joints[j].name
+            words = f"The columns of {one} and {other} are exchanged: exchange them in the map."
+            swap = _swap(dof, i, j)
+            yield _Change("order", (one, other), words, q=swap, slopes=swap)
     for i, j in itertools.combinations(range(n_act), 2):
-        order = np.arange(n_act)
-        order[[i, j]] = j, i
-        yield _Change(
-            "order",
-            (twin.actuators[i].name, twin.actuators[j].name),
-            f"The commands {twin.actuators[i].name} and {twin.actuators[j].name} are exchanged: "
-            "exchange their columns in the map.",
-            same,
-            same,
-            lambda u, order=order: u[:, order],
-            one,
-        )
+        one, other = actuators[i].name, actuators[j].name
+        words = f"The commands {one} and {other} are exchanged: exchange their columns in the map."
+        yield _Change("order", (one, other), words, actions=_swap(n_act, i, j))
+
+
+def _swap(n: int, i: int, j: int) -> Callable[[np.ndarray], np.ndarray]:
+    order = np.arange(n)
+    order[[i, j]] = j, i
+    return lambda x: x[:, order]
 
 
 def _changed(motion: Motion, change: _Change) -> Motion:
     recordings = tuple(
-        Moved(
-            change.q(r.q),
-            change.slopes(r.v),
-            change.slopes(r.a),
-            change.slopes(r.raw),
-            change.actions(r.actions),
-        )
+        Moved(change.q(r.q), *map(change.slopes, (r.v, r.a, r.raw)), change.actions(r.actions))
         for r in motion.recordings
     )
-    order = change.slopes(np.arange(1.0, len(motion.noise_q) + 1.0)[None] / change.scale)[0]
-    places = np.round(np.abs(order)).astype(int) - 1 if change.name == "order" else slice(None)
+    places = np.arange(len(motion.noise_q))
+    if change.name == "order":
+        places = change.slopes(places[None])[0]
     return motion._replace(
         recordings=recordings,
         noise_q=(motion.noise_q * change.scale)[places],

@@ -20,7 +20,7 @@ from sb3_hds.sysid.equation.problem import Problem
 from sb3_hds.sysid.equation.regression import STEP, Equation, Item, Rows, put
 from sb3_hds.sysid.equation.selection import LATE
 from sb3_hds.sysid.equation.terms import effective_inertia, terms
-from sb3_hds.sysid.equation.weak_form import Grams
+from sb3_hds.sysid.equation.weak_form import grams
 from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.motion.joints import encoders
@@ -55,9 +55,8 @@ def equation(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equ
     missing, smooth = force(rows.measured), force(rows.change)
     load = np.einsum("nij,nj->ni", found.mass, rows.a) + found.bias
     made = Equation(
+        motion=motion,
         missing=missing,
-        columns=[],
-        items=[],
         recording=rows.recording,
         q=rows.q,
         v=rows.v,
@@ -65,10 +64,6 @@ def equation(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equ
         actuator=found.actuator,
         mass=found.mass,
         effective=effective,
-        slopes={},
-        noisy={},
-        drives={},
-        motion=motion,
     )
     typical = np.sqrt(np.mean(np.concatenate([load, found.actuator]) ** 2)) + 1e-300
     refuted = set() if quick else refuted_by_kinematics(twin, motion)
@@ -157,7 +152,7 @@ def _add_parameter(
     ):
         return
     index = put(made, None, column)
-    made.items.append(Item(candidate, (index,), (None,), "linear", (), (name,)))
+    made.items.append(Item(candidate, (index,), (name,)))
     slope = (there.mass - made.mass) / step
     if np.abs(slope).max() > 0.0:
         made.slopes[candidate.key] = slope
@@ -170,8 +165,8 @@ def _add_parameter(
 
 
 # ------------------------------------------------------------------------------ the problem
-def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
-    """:param made: normal equations of the equation"""
+def problem(hypotheses: Hypotheses, equation: Equation) -> Problem:
+    """:return: its normal equations, with bounds, prices and prior odds of all items"""
     items, n = tuple(equation.items), len(equation.columns)
     lower, upper, prior = np.full(n, -np.inf), np.full(n, np.inf), np.zeros(n + 1)
     always = []
@@ -194,10 +189,9 @@ def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
     force = np.sqrt(np.mean(equation.actuator**2, axis=0))
     force = np.maximum(force, np.sqrt(np.mean(equation.load**2, axis=0))) + 1e-300
     some = np.linspace(0, len(equation.mass) - 1, min(32, len(equation.mass))).astype(int)
-    total = made.by_joint.sum(0)
     return Problem(
         items=items,
-        grams=made,
+        grams=grams(equation),
         lower=lower,
         upper=upper,
         prior=prior,
@@ -214,8 +208,6 @@ def problem(hypotheses: Hypotheses, equation: Equation, made: Grams) -> Problem:
         least=_least_late(equation, items),
         always=tuple(always),
         rarity=tuple(rarity_of(item.candidate, hypotheses.believed) for item in items),
-        total=total,
-        cost=float(np.log(made.effective.mean())),
     )
 
 

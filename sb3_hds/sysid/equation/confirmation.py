@@ -1,7 +1,6 @@
 """Which members of a set held-out data confirm, what stands for them, and what they leave."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -37,24 +36,6 @@ _NO_MATTER = 0.02
 _SOME = 0.02
 
 
-class Left(NamedTuple):
-    """
-    What a set leaves at a joint.
-
-    :param share: residual over force at the joint, root mean squares over rows
-    :param noise: residual in units of what velocity noise alone would leave
-    :param predictable: share of its variance that all columns together predict on held-out data
-    :param most: key of the candidate that would reduce it most
-    :param gain: relative decrease of the held-out error, compared with the nominal model
-    """
-
-    share: float
-    noise: float
-    predictable: float
-    most: str
-    gain: float
-
-
 def material(p: Problem, keys: list[int]) -> list[int]:
     """Remove members with a negligible force, unless they explain most of what the others leave."""
     held = p.held_out(keys)
@@ -84,7 +65,8 @@ def confirmed(p: Problem, keys: list[int]) -> list[int]:
             else worth(p, p.held_out([m for m in keys if m != i]), held, i)[1]
             for i in keys
         ]
-        short = [x - _least_t(p, i) for i, x in zip(keys, t, strict=True)]
+        # The rarer a cause is, the surer it has to be.
+        short = [x - (_CONFIRMED + _RARE * p.rarity[i]) for i, x in zip(keys, t, strict=True)]
         if min(short) > 0.0:
             break
         rest = [i for i, x in zip(keys, short, strict=True) if x > min(short)]
@@ -169,11 +151,6 @@ def worth(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> tuple[fl
     return float(x.mean()), float(x.mean() / (x.std(ddof=1) / np.sqrt(len(x)) + 1e-9))
 
 
-def _least_t(p: Problem, i: int) -> float:
-    """The rarer a cause is, the surer it has to be."""
-    return _CONFIRMED + _RARE * p.rarity[i]
-
-
 def outstanding(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
     """
     An effect that is no larger than the unexplained structure may be a part of that misfit.
@@ -182,56 +159,35 @@ def outstanding(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
     """
     keys, hints = list(keys), []
     while keys:
-        left = np.array(
-            [x.share * np.sqrt(np.clip(x.predictable, 0.0, 1.0)) for x in what_is_left(p, keys)]
-        )
-        found, ratio = p.solve(keys), []
+        found, grams = p.solve(keys), p.grams
+        rss = np.maximum([found.weights @ g @ found.weights for g in grams.by_joint], 1e-12)
+        share = np.sqrt(rss / grams.effective) * grams.scale / (p.force * grams.gain)
+        left = share * np.sqrt(np.clip(predictable(p, keys), 0.0, 1.0))
+        ratio = []
         for i in keys:
-            force = p.force_of(i, found) / p.force
-            own = force / np.maximum(left, 1e-6) / _least_ratio(p, i)
+            # Friction that every joint has stands out sooner than what is rare.
+            least = _OUTSTANDING * (1.0 + min(p.rarity[i], _RAREST)) / (1.0 + _RAREST)
+            own = p.force_of(i, found) / p.force / np.maximum(left, 1e-6) / least
             ratio.append(np.inf if i in p.always else float(np.max(own)))
         if min(ratio) >= 1.0:
             break
-        worst = int(np.argmin(ratio))
-        hints.append(keys.pop(worst))
+        hints.append(keys.pop(int(np.argmin(ratio))))
     return keys, hints
 
 
-def _least_ratio(p: Problem, i: int) -> float:
-    """Friction that every joint has stands out sooner than what is rare."""
-    return _OUTSTANDING * (1.0 + min(p.rarity[i], _RAREST)) / (1.0 + _RAREST)
+def predictable(p: Problem, keys: Sequence[int]) -> np.ndarray:
+    """
+    Ridge regression of the residual of a set on all linear columns, fold by fold.
+
+    :return: share of each joint's residual variance that it predicts on held-out data
+    """
+    weights = p.solve(keys).weights
+    rich = rich_columns(list(p.items), np.arange(len(weights) - 1))
+    return np.array([_predictable(p, weights, rich, j) for j in range(p.dof)])
 
 
-def what_is_left(p: Problem, keys: Sequence[int]) -> list[Left]:
-    """:return: at each joint"""
-    weights, grams, out = p.solve(keys).weights, p.grams, []
-    nominal = p.held_out(list(p.always)).sum(0)
-    gain = 1.0 - np.sqrt(p.held_out(keys).sum(0) / np.maximum(nominal, 1e-300))
-    others = [i for i in range(len(p.items)) if i not in keys]
-    for j in range(p.dof):
-        gram = grams.by_joint[j]
-        rss = max(float(weights @ gram @ weights), 1e-12)
-        diagonal = np.diag(gram) + 1e-300
-        noise = np.sqrt(rss / grams.effective[j])
-        floor = grams.floor[j]
-        slope = (gram @ weights) ** 2 / diagonal / rss
-        most = max(others, key=lambda i: max(slope[list(p.items[i].free)], default=0.0), default=-1)
-        out.append(
-            Left(
-                share=float(noise * grams.scale[j] / (p.force[j] * grams.gain[j])),
-                noise=float(noise / floor) if floor > 0.0 else np.nan,
-                predictable=_predictable(p, weights, j, diagonal),
-                most=p.items[most].key if most >= 0 else "",
-                gain=float(gain[j]),
-            )
-        )
-    return out
-
-
-def _predictable(p: Problem, weights: np.ndarray, j: int, diagonal: np.ndarray) -> float:
-    """Ridge regression of what is left on all linear columns, fold by fold."""
-    columns = np.arange(len(weights) - 1)
-    rich = columns[rich_columns(list(p.items), columns)]
+def _predictable(p: Problem, weights: np.ndarray, rich: np.ndarray, j: int) -> float:
+    diagonal = np.diag(p.grams.by_joint[j]) + 1e-300
     rich = rich[diagonal[rich] > 1e-12]
     on = np.union1d(rich, np.flatnonzero(weights))
     rich, weights = np.searchsorted(on, rich), weights[on]

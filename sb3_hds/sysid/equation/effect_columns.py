@@ -47,8 +47,7 @@ def add_force(
 ) -> None:
     """Columns of a force at a joint: its derivatives by its parameters, at fixed settings."""
     j, motion = candidate.index, made.motion
-    ranges = ranges_of(made, rows, j, None)
-    settings = effect.grid(ranges)
+    settings = effect.grid(ranges_of(made, rows, j, None))
     names = tuple(effect.parameters)
     nulls = {name: p.null for name, p in effect.parameters.items()}
     given = settings or ({},)
@@ -59,9 +58,7 @@ def add_force(
         for first in range(0, len(settings) - 1, 2):
             pair = [put(made, j, slopes[first + k, 0]) for k in (0, 1)]
             own = (settings[first], settings[first + 1])
-            made.items.append(
-                Item(candidate, tuple(pair), (None, None), "blend", own, (names[0], names[0]))
-            )
+            made.items.append(Item(candidate, tuple(pair), names[:1] * 2, "blend", own))
         return
     for at, by_name in zip(given, slopes, strict=True):
         useful = [
@@ -69,17 +66,8 @@ def add_force(
         ]
         if useful:
             columns = tuple(put(made, j, by_name[i]) for i in useful)
-            own = (at,) if at else ()
-            made.items.append(
-                Item(
-                    candidate,
-                    columns,
-                    (None,) * len(columns),
-                    "linear",
-                    own,
-                    tuple(names[i] for i in useful),
-                )
-            )
+            own = tuple(names[i] for i in useful)
+            made.items.append(Item(candidate, columns, own, settings=(at,) if at else ()))
 
 
 def add_closed_form(made: Equation, candidate: Candidate, nodes: Mapping[str, np.ndarray]) -> None:
@@ -87,7 +75,7 @@ def add_closed_form(made: Equation, candidate: Candidate, nodes: Mapping[str, np
     name, by_speed = CLOSED_FORMS[candidate.name]
     values = np.sum(nodes["weights"] * by_speed(nodes["v"]), axis=(1, 2))
     column = put(made, candidate.index, values)
-    made.items.append(Item(candidate, (column,), (None,), "linear", (), (name,)))
+    made.items.append(Item(candidate, (column,), (name,)))
 
 
 def nodes_of(
@@ -100,9 +88,8 @@ def nodes_of(
     Where the model brakes what a force sets in motion, a force counts the more, the later it acts.
     """
     motion, dt = made.motion, made.motion.dt
-    q, v, next_q, next_v = (
-        x[:, joint, None, None] for x in (rows.q, rows.v, rows.next_q, rows.next_v)
-    )
+    ends = rows.q, rows.v, rows.next_q, rows.next_v
+    q, v, next_q, next_v = (x[:, joint, None, None] for x in ends)
     first = v + motion.error_v[joint] * _PLACES
     change = motion.seen * (next_v - v)
     turns = first * (first + change) < 0.0
@@ -148,20 +135,16 @@ def _force_slopes(
 ) -> np.ndarray:
     """:return: derivative of the mean force by each parameter, ``(settings, parameters, n)``"""
     found = []
-    effect, standstill = _for_any_joint(effect)
+    # One program serves all joints: the speed in which they differ is an argument of it.
+    standstill = 0.0
+    if isinstance(effect, DryFriction):
+        effect, standstill = _standing_still_at(effect, 1.0), effect.standstill
     with jax.enable_x64(True):
         for index, n in portions(len(nodes["load"])):
             given = {name: jnp.asarray(x[index], jnp.float64) for name, x in nodes.items()}
             slopes = [_slopes_of(effect, standstill, each, given, h) for each in settings]
             found.append(np.stack(slopes)[..., :n])
     return np.concatenate(found, -1)
-
-
-def _for_any_joint(effect: JointEffect) -> tuple[JointEffect, float]:
-    """One program serves all joints: what differs between them is told apart from the effect."""
-    if not isinstance(effect, DryFriction):
-        return effect, 0.0
-    return _standing_still_at(effect, 1.0), effect.standstill
 
 
 def _standing_still_at(effect: DryFriction, speed: Any) -> DryFriction:
@@ -207,8 +190,7 @@ def add_command(
     twin, i, dt = hypotheses.believed, candidate.index, made.motion.dt
     if not rows.actions.size or not np.ptp(rows.actions[:, i]) > 0.0:
         return
-    ranges = ranges_of(made, rows, None, i)
-    settings, names = effect.grid(ranges), tuple(effect.parameters)
+    settings, names = effect.grid(ranges_of(made, rows, None, i)), tuple(effect.parameters)
     nulls = {name: p.null for name, p in effect.parameters.items()}
     if effect.chained and len(settings) < 2:
         return
@@ -228,23 +210,13 @@ def add_command(
                 columns.append(put_acting(made, change / step))
                 useful.append(name)
         if columns:
-            made.items.append(
-                Item(candidate, tuple(columns), (None,) * len(columns), "linear", (), tuple(useful))
-            )
+            made.items.append(Item(candidate, tuple(columns), tuple(useful)))
         return
     for k in range(len(settings) - 1):
         whole = put_acting(made, changes[k])
         part = put_acting(made, changes[k + 1] - changes[k])
-        made.items.append(
-            Item(
-                candidate,
-                (whole, part),
-                (1.0, None),
-                "chain",
-                (settings[k], settings[k + 1]),
-                (effect.chained, effect.chained),
-            )
-        )
+        own = (effect.chained, effect.chained)
+        made.items.append(Item(candidate, (whole, part), own, "chain", settings[k : k + 2]))
 
 
 def add_common(made: Equation, hypotheses: Hypotheses) -> None:
@@ -258,18 +230,14 @@ def add_common(made: Equation, hypotheses: Hypotheses) -> None:
         for items in by_settings.values():
             if len(items) < places or places < 2:
                 continue
-            first = items[0]
             columns = []
-            for k in range(len(first.columns)):
+            for same in zip(*(item.columns for item in items), strict=True):
                 total = np.zeros_like(made.missing)
-                for item in items:
-                    column = made.columns[item.columns[k]]
-                    own_joint = slice(None) if column.joint is None else column.joint
-                    total[:, own_joint] += column.values
+                for column in (made.columns[c] for c in same):
+                    total[:, slice(None) if column.joint is None else column.joint] += column.values
                 columns.append(put(made, None, total))
-            made.items.append(
-                dataclasses.replace(first, candidate=candidate, columns=tuple(columns))
-            )
+            shared = dataclasses.replace(items[0], candidate=candidate, columns=tuple(columns))
+            made.items.append(shared)
 
 
 def _commanded(
@@ -332,7 +300,9 @@ def add_sensor(
     (name, parameter), *others = effect.parameters.items()
     if others or parameter.upper - parameter.lower == 1.0:
         return  # a switch is no matter of degree
-    spread = np.std(_observed(twin, rows.q, rows.v)[:, channels[0]])
+    with jax.enable_x64(True):
+        observed = np.asarray(_observations(twin, jnp.asarray(rows.q), jnp.asarray(rows.v)))
+    spread = np.std(observed[:, channels[0]])
     step = STEP * (spread if parameter.unit == "channel unit" else 1.0)
     if not step > 0.0:
         return
@@ -348,12 +318,7 @@ def add_sensor(
     column = -(moved - smooth) / step
     if np.isfinite(column).all() and np.abs(column).max() > 0.0:
         index = put(made, None, column)
-        made.items.append(Item(candidate, (index,), (None,), "linear", (), (name,)))
-
-
-def _observed(twin: Twin, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    with jax.enable_x64(True):
-        return np.asarray(_observations(twin, jnp.asarray(q), jnp.asarray(v)))
+        made.items.append(Item(candidate, (index,), (name,)))
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
@@ -374,11 +339,8 @@ def _reread(
     with jax.enable_x64(True):
         found = _inverted(twin, effect, channels, jnp.asarray(q), jnp.asarray(v), value)
         new_q, new_v = map(np.asarray, found)
-    if not new_v.any():
-        new_v = v  # no velocity is observed: its scale is that of the position
-        (name,) = effect.parameters
-        if name == "scale":
-            new_v = v / value
+    if not new_v.any():  # no velocity is observed: its scale is that of the position
+        new_v = v / value if "scale" in effect.parameters else v
     turns = 2.0 * np.pi * np.round((q - new_q) / (2.0 * np.pi))
     rotary = np.array([joint.unit == "rad" for joint in twin.joints])
     return new_q + np.where(rotary, turns, 0.0), new_v

@@ -1,6 +1,6 @@
 """The members of a set: sizes, intervals, alternatives, and friction against velocity."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ _MORE_SETS, _TRIED_SETS, _SWAPPED = 12, 60, 4
 
 # Groups of intervals of similar velocity, and the fewest intervals of a group.
 _GROUPS, _LEAST = 48, 5
-_FAMILIES = ("viscous", "dry", "drag")
+_FRICTION = ("viscous", "dry", "drag")  # families
 
 
 class Member(NamedTuple):
@@ -222,22 +222,16 @@ class FrictionCurve(NamedTuple):
     found: np.ndarray
 
 
-def by_velocity(equation: Equation) -> tuple[ByVelocity, ...]:
-    """:return: of each joint"""
-    return tuple(_of_joint(equation, j) for j in range(equation.missing.shape[1]))
-
-
-def _of_joint(equation: Equation, j: int) -> ByVelocity:
-    pairs = [(i, values) for i, c in enumerate(equation.columns) if (values := c.at(j)) is not None]
+def by_velocity(equation: Equation, j: int) -> ByVelocity:
+    """:return: the equation of one joint, averaged"""
+    acting = {i: values for i, c in enumerate(equation.columns) if (values := c.at(j)) is not None}
     order = np.argsort(equation.v[:, j], kind="stable")
     n = max(min(_GROUPS, len(order) // _LEAST), 1)
     begins = np.arange(n) * len(order) // n
     sizes = np.diff(begins, append=len(order))
     mean = lambda values: np.add.reduceat(values[order], begins) / sizes  # noqa: E731
-    forces = [mean(values) for values in (*(v for _, v in pairs), equation.missing[:, j])]
-    return ByVelocity(
-        mean(equation.v[:, j]), np.stack(forces, 1), np.array([i for i, _ in pairs], int)
-    )
+    forces = [mean(values) for values in (*acting.values(), equation.missing[:, j])]
+    return ByVelocity(mean(equation.v[:, j]), np.stack(forces, 1), np.array([*acting], int))
 
 
 def friction_curves(
@@ -248,22 +242,15 @@ def friction_curves(
     :param items: of a set of causes
     :return: of each joint with friction in the set
     """
-    found = p.solve(items)
-    own = [i for i in items if _is_friction(p, i)]
-    curves = []
-    for j in sorted({int(p.items[i].candidate.index) for i in own}):
-        columns = {c for i in own if p.items[i].candidate.index == j for c in p.items[i].columns}
-        curves.append(_curve(j, groups[j], found.weights, columns))
+    weights, columns, curves = p.solve(items).weights, {}, []
+    for item in (p.items[i] for i in items):
+        candidate = item.candidate
+        if candidate.slot == "joint" and plausibility(candidate.name).family in _FRICTION:
+            columns.setdefault(int(candidate.index), set()).update(item.columns)
+    for j in sorted(columns):
+        own = groups[j]
+        left = own.forces @ weights[[*own.used, -1]]
+        inside = np.isin(own.used, list(columns[j]))
+        found = own.forces[:, :-1][:, inside] @ weights[own.used[inside]]
+        curves.append(FrictionCurve(j, own.velocity, found - left, found))
     return tuple(curves)
-
-
-def _is_friction(p: Problem, i: int) -> bool:
-    candidate = p.items[i].candidate
-    return candidate.slot == "joint" and plausibility(candidate.name).family in _FAMILIES
-
-
-def _curve(j: int, own: ByVelocity, weights: np.ndarray, columns: Collection[int]) -> FrictionCurve:
-    left = own.forces @ weights[[*own.used, -1]]
-    inside = np.isin(own.used, list(columns))
-    found = own.forces[:, :-1][:, inside] @ weights[own.used[inside]]
-    return FrictionCurve(j, own.velocity, found - left, found)

@@ -7,6 +7,7 @@ as a reference (viscous friction, which every joint has); they decide between ex
 cannot tell apart, and a cause with poor odds has to explain more before it is named at all.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -73,6 +74,7 @@ _SET_POINT = 3.0
 _OF_AMPLIFIERS = ("torque_gain", "directional_gain", "dead_zone", "saturation")
 
 
+@functools.cache
 def plausibility(effect: str) -> Plausibility:
     """:param effect: name in the catalogue, or ``parameter.NAME``; others are taken to be rare"""
     name = effect.partition(".")[0]

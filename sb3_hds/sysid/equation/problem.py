@@ -74,8 +74,6 @@ class Problem:
     :param least: of what makes commands late, the smallest admissible coefficient
     :param always: items of every set: the nuisance parameters
     :param rarity: of each item, minus the logarithm of its prior odds
-    :param total: normal matrix over all joints, shape ``(columns + 1, columns + 1)``
-    :param cost: penalty of one parameter: the logarithm of the effective number of rows
     """
 
     items: tuple[Item, ...]
@@ -96,12 +94,20 @@ class Problem:
     least: dict[int, float]
     always: tuple[int, ...]
     rarity: tuple[float, ...]
-    total: np.ndarray
-    cost: float
 
     @property
     def dof(self) -> int:
         return len(self.grams.effective)
+
+    @cached_property
+    def total(self) -> np.ndarray:
+        """Normal matrix over all joints, shape ``(columns + 1, columns + 1)``."""
+        return self.grams.by_joint.sum(0)
+
+    @cached_property
+    def cost(self) -> float:
+        """Penalty of one parameter: the logarithm of the effective number of rows."""
+        return float(np.log(self.grams.effective.mean()))
 
     def place(self, i: int) -> tuple[str, int]:
         """:return: slot and index"""
@@ -110,23 +116,17 @@ class Problem:
 
     def family(self, i: int) -> tuple:
         """A set contains at most one item of each family."""
-        return self._families[i]
-
-    @cached_property
-    def _families(self) -> tuple[tuple, ...]:
-        return tuple(
-            (item.key,)
-            if item.candidate.slot == PARAMETER
-            else (plausibility(item.candidate.name).family, *self.place(i))
-            for i, item in enumerate(self.items)
-        )
+        candidate = self.items[i].candidate
+        if candidate.slot == PARAMETER:
+            return (candidate.key,)
+        return plausibility(candidate.name).family, *self.place(i)
 
     def clashes(self, keys: Sequence[int]) -> bool:
         """Whether two items exclude each other."""
         families = [self.family(i) for i in keys]
         if len(set(families)) < len(families):
             return True
-        common = {f[0] for f in families if f[1:] == ("actuator", -1)}
+        common = {f[0] for f in families if f[1:] == SHARED}
         return any(f[0] in common and f[1:2] == ("actuator",) and f[2] >= 0 for f in families)
 
     def joints(self, i: int) -> np.ndarray:
@@ -168,10 +168,7 @@ class Problem:
         free = [c for item in items for c in item.free]
         weights = np.zeros(len(gram))
         weights[-1] = 1.0
-        for item in items:
-            for c, value in zip(item.columns, item.fixed, strict=True):
-                if value is not None:
-                    weights[c] = -value
+        weights[[item.columns[0] for item in items if item.rule == "chain"]] = -1.0
         own = np.array([*dict.fromkeys(c for item in items for c in item.columns), len(gram) - 1])
         local = gram[own[:, None], own]
         at = {int(c): k for k, c in enumerate(own)}
@@ -233,8 +230,8 @@ class Problem:
             for i in keys
             if i in self.always and any(set(self.joints(i)) & set(self.joints(m)) for m in members)
         }
-        worst = max(beyond, key=lambda i: beyond[i], default=-1)
-        return {worst} if worst >= 0 and beyond[worst] > _MOST_INFLATION else set()
+        worst = max(beyond, key=lambda i: beyond[i], default=None)
+        return set() if worst is None or beyond[worst] <= _MOST_INFLATION else {worst}
 
     def _inflation(self, free: Sequence[int], inverse: np.ndarray) -> np.ndarray:
         """:return: variance of each coefficient, in units of what it would be alone"""
@@ -393,8 +390,7 @@ class Problem:
 
     def force_of(self, i: int, found: Solution) -> np.ndarray:
         """:return: root mean square force of a member at each joint"""
-        value, item = found.value, self.items[i]
-        total = np.zeros(self.dof)
-        for c, fixed in zip(item.columns, item.fixed, strict=True):
-            total += (value.get(c, fixed or 0.0) * self.shares[:, c]) ** 2
-        return np.sqrt(total)
+        item, value = self.items[i], found.value
+        if item.rule == "chain":
+            value = {item.columns[0]: 1.0} | value
+        return np.sqrt(sum((value.get(c, 0.0) * self.shares[:, c]) ** 2 for c in item.columns))

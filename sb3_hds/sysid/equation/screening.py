@@ -8,13 +8,7 @@ import numpy as np
 from sb3_hds.core import AnalyticTwin, Effect, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.sysid.equation.assembly import equation, problem, refuted_by_kinematics
-from sb3_hds.sysid.equation.confirmation import (
-    Left,
-    admitted,
-    retuned,
-    simpler,
-    what_is_left,
-)
+from sb3_hds.sysid.equation.confirmation import admitted, predictable, retuned, simpler
 from sb3_hds.sysid.equation.members import (
     ByVelocity,
     FrictionCurve,
@@ -25,7 +19,6 @@ from sb3_hds.sysid.equation.members import (
 )
 from sb3_hds.sysid.equation.problem import Problem
 from sb3_hds.sysid.equation.selection import propose
-from sb3_hds.sysid.equation.weak_form import grams, weak_rows
 from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.parameters import Belief
@@ -64,7 +57,6 @@ class Screened(NamedTuple):
     :param motion: of the joints
     :param members: of the best set by information criterion
     :param hints: keys of effects that are small beside the unexplained residual
-    :param left: what the set leaves at each joint
     :param keys: of the candidates that are worth a simulation
     :param nameless_at: joints at which flexible forces are tried
     :param by_velocity: the equation of each joint, averaged over intervals of similar velocity
@@ -75,23 +67,23 @@ class Screened(NamedTuple):
     motion: Motion
     members: tuple[Member, ...]
     hints: tuple[str, ...]
-    left: tuple[Left, ...]
     keys: frozenset[str]
     nameless_at: tuple[str, ...]
     by_velocity: tuple[ByVelocity, ...]
 
     def among(self, keys: Collection[str]) -> "Screened":
         """:return: the same with some members, solved and judged anew without the others"""
-        p, rest = self.problem, [m.item for m in self.members if m.key in keys]
-        found = admitted(p, retuned(p, [*p.always, *rest]))
-        return self._replace(members=_members_of(self.hypotheses, p, found))
+        return self._with_items([m.item for m in self.members if m.key in keys])
 
     def without(self, keys: Collection[str]) -> "Screened":
         """:return: the same with simpler members of their families instead of some, or none"""
-        p = self.problem
         rest = [m.item for m in self.members if m.key not in keys]
-        rest += [o for m in self.members if m.key in keys for o in simpler(p, m.item)[:1]]
-        found = admitted(p, retuned(p, [*p.always, *rest]))
+        left_out = [m.item for m in self.members if m.key in keys]
+        return self._with_items(rest + [o for i in left_out for o in simpler(self.problem, i)[:1]])
+
+    def _with_items(self, items: Sequence[int]) -> "Screened":
+        p = self.problem
+        found = admitted(p, retuned(p, [*p.always, *items]))
         return self._replace(members=_members_of(self.hypotheses, p, found))
 
     def sizes_of(self, keys: Collection[str]) -> dict[str, float]:
@@ -109,8 +101,9 @@ class Screened(NamedTuple):
     def intervals_of(self, member: Member) -> dict[str, tuple[float, float, float]]:
         """:return: estimate and ends of the interval by full name"""
         candidate = self.problem.items[member.item].candidate
-        parts = [self._by_full_name(candidate, x) for x in (member.sizes, member.low, member.high)]
-        value, low, high = parts
+        value, low, high = (
+            self._by_full_name(candidate, x) for x in (member.sizes, member.low, member.high)
+        )
         return {n: (value[n], min(low[n], high[n]), max(low[n], high[n])) for n in value}
 
     def friction_curves(self, keys: Collection[str]) -> tuple[FrictionCurve, ...]:
@@ -135,16 +128,14 @@ class Screened(NamedTuple):
 
     def doubts_of(self, member: Member) -> dict[str, float]:
         """:return: by full name, as in :class:`Estimates`"""
-        candidate = self.problem.items[member.item].candidate
-        names = {name.rpartition(".")[2]: name for name in candidate.parameters}
+        names = self.problem.items[member.item].candidate.full_names
         return {names[short]: doubt for short, doubt in member.doubt.items()}
 
     def _by_full_name(self, candidate: Candidate, sizes: Mapping[str, float]) -> dict[str, float]:
-        if candidate.slot == "parameter":
+        if candidate.slot == PARAMETER:
             (name,) = sizes
             return {name: self.hypotheses.believed.values[name] + sizes[name]}
-        shorts = {name.rpartition(".")[2]: name for name in candidate.parameters}
-        return {shorts[short]: float(value) for short, value in sizes.items()}
+        return {candidate.full_names[short]: float(value) for short, value in sizes.items()}
 
     @property
     def detectable(self) -> dict[str, dict[str, float]]:
@@ -191,12 +182,10 @@ class Screened(NamedTuple):
         for item in p.items:
             if item.rule != "linear":
                 continue
-            shorts = {name.rpartition(".")[2]: name for name in item.candidate.parameters}
             for column, name in zip(item.columns, item.names, strict=True):
                 share = float(np.max(p.shares[:, column] / p.force))
-                full = name if item.candidate.slot == "parameter" else shorts[name]
                 if share > 0.0:
-                    found.setdefault(full, _TYPICAL / share)
+                    found.setdefault(item.candidate.full_names[name], _TYPICAL / share)
         return found
 
 
@@ -211,9 +200,7 @@ def screen(
     :param moved: joints, as measured
     :return: None where there is no equation of motion, or nothing moves
     """
-    if not isinstance(plant_of(twin), AnalyticTwin):
-        return None
-    if not moved.moves.any():
+    if not isinstance(plant_of(twin), AnalyticTwin) or not moved.moves.any():
         return None
     coarse = moved.twin(twin)
     hypotheses = Hypotheses.about(
@@ -222,18 +209,15 @@ def screen(
     made = equation(hypotheses, moved)
     if not made.items:
         return None
-    p = problem(hypotheses, made, grams(made, weak_rows(made)))
+    p = problem(hypotheses, made)
     found = propose(p)
     set_of = _members_of(hypotheses, p, [i for i in found.keys if i not in p.always])
-    left = what_is_left(p, found.keys)
     hints = tuple(p.items[i].key for i in found.hints)
-    joints = [joint.name for joint in coarse.joints]
-    small = len(joints) <= SMALL_MACHINE
-    where = [
-        name
-        for name, x in zip(joints, left, strict=True)
-        if small or (len(set_of) < 2 and x.predictable > _LEFT)
-    ]
+    small = len(coarse.joints) <= SMALL_MACHINE
+    where = [joint.name for joint in coarse.joints]
+    if not small:
+        left = predictable(p, found.keys) > _LEFT
+        where = [n for n, much in zip(where, left, strict=True) if much and len(set_of) < 2]
     keys = {m.key for m in set_of}
     keys |= {p.items[o].key for m in set_of for o in simpler(p, m.item)}
     if small or len(set_of) < 2:
@@ -246,10 +230,9 @@ def screen(
         motion=moved,
         members=set_of,
         hints=hints,
-        left=tuple(left),
         keys=frozenset(keys),
         nameless_at=tuple(where),
-        by_velocity=by_velocity(made),
+        by_velocity=tuple(by_velocity(made, j) for j in range(p.dof)),
     )
 
 
@@ -288,13 +271,10 @@ def _without_column(h: Hypotheses, p: Problem, moved: Motion, where: Sequence[st
     refuted = refuted_by_kinematics(h.believed, moved)
     found = set()
     for candidate in h.candidates:
-        if candidate.key in there or candidate.key in refuted:
-            continue
-        if candidate.slot == "joint" and candidate.place not in where:
-            continue
-        if candidate.slot != "joint" and len(moved.speed) > SMALL_MACHINE:
-            continue
-        if candidate.slot == "parameter":
-            continue
-        found.add(candidate.key)
+        if candidate.slot == "joint":
+            asked = candidate.place in where
+        else:
+            asked = candidate.slot != PARAMETER and len(moved.speed) <= SMALL_MACHINE
+        if asked and candidate.key not in there | refuted:
+            found.add(candidate.key)
     return found

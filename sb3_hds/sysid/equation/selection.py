@@ -1,6 +1,6 @@
 """Which causes, all at once: a search over families, judged on data that were held out."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from sb3_hds.sysid.equation.confirmation import (
     swaps,
 )
 from sb3_hds.sysid.equation.problem import SHARED, Problem
+from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Moves that are tried from each set: of what promises most when added, and in the place of another.
 _ADDED, _SWAPPED, _MOST_MOVES = 12, 5, 80
@@ -38,9 +39,7 @@ class Proposal(NamedTuple):
 
 def propose(problem: Problem) -> Proposal:
     """:return: the set of causes that explains most for its price, each of which data confirm"""
-    starts = _starts(problem)
-    results = [_climb(problem, keys) for keys in starts]
-    _, keys = min(results, key=lambda r: r[0])
+    _, keys = min((_climb(problem, start) for start in _starts(problem)), key=lambda r: r[0])
     keys = _shared_instead(problem, keys)
     keys = _shaken(problem, keys)
     keys = material(problem, keys)
@@ -59,10 +58,13 @@ def _starts(p: Problem) -> list[list[int]]:
     if p.dof < 3 or not friction:
         starts.append(list(p.always))
     for name in LATE:
+        # The bus that all actuators share, where there is one.
+        own = [item.candidate.index for item in p.items if item.candidate.name == name]
+        first = min(own, default=0)
         options = [
             i
             for i, item in enumerate(p.items)
-            if item.candidate.name == name and item.candidate.index == _first_place(p, name)
+            if item.candidate.name == name and item.candidate.index == first
         ]
         tried = [_friction_beside(p, [*p.always, i]) for i in options]
         best = min(tried, key=p.score, default=friction)
@@ -71,22 +73,14 @@ def _starts(p: Problem) -> list[list[int]]:
     return starts
 
 
-def _first_place(p: Problem, name: str) -> int:
-    """The bus that all actuators share, where there is one."""
-    return min((item.candidate.index for item in p.items if item.candidate.name == name), default=0)
-
-
 def _friction_beside(p: Problem, others: list[int]) -> list[int]:
     """Viscous and dry friction everywhere; what would drive leaves, the most negative first."""
     names = (_VISCOUS, _DRY)
-    keys = [i for i, item in enumerate(p.items) if item.candidate.name in names] + others
+    friction = [i for i, item in enumerate(p.items) if item.candidate.name in names]
+    keys = friction + others
     while True:
-        found = p.solve(keys)
-        bad = [
-            i
-            for i in keys
-            if p.items[i].candidate.name in names and p.items[i].columns[0] in found.held
-        ]
+        held = p.solve(keys).held
+        bad = [i for i in keys if i in friction and p.items[i].columns[0] in held]
         if not bad:
             return keys
         keys = [i for i in keys if i not in bad]
@@ -96,13 +90,8 @@ def _friction_beside(p: Problem, others: list[int]) -> list[int]:
 def _climb(p: Problem, keys: list[int], barred: Collection[int] = ()) -> tuple[float, list[int]]:
     """:param barred: items that no set may have"""
     score = p.score(keys)
-    moves: tuple[Callable[[Problem, list[int]], list[list[int]]], ...] = (
-        _add_or_drop,
-        _swap,
-        _at_all_joints,
-    )
     for _ in range(_MOST_MOVES):
-        for move in moves:
+        for move in (_add_or_drop, _swap, _at_all_joints):
             tried = [
                 (p.score(t), t)
                 for t in move(p, keys)
@@ -126,9 +115,7 @@ def _add_or_drop(p: Problem, keys: list[int]) -> list[list[int]]:
 
 def _swap(p: Problem, keys: list[int]) -> list[list[int]]:
     trials = []
-    for i in keys:
-        if i in p.always:
-            continue
+    for i in (i for i in keys if i not in p.always):
         rest = [m for m in keys if m != i]
         trials += [[*rest, o] for o in p.ranking(rest, swaps(p, keys, i))[:_SWAPPED]]
     return trials
@@ -145,11 +132,10 @@ def _at_all_joints(p: Problem, keys: list[int]) -> list[list[int]]:
         if len(without) < len(keys):
             trials.append(without)
         single = [i for i in every if p.items[i].rule == "linear" and not p.items[i].settings]
-        if len(single) > 1 and p.items[single[0]].candidate.slot != "parameter":
+        if len(single) > 1 and p.items[single[0]].candidate.slot != PARAMETER:
             taken = {p.family(i) for i in without}
-            trials.append(
-                _inside_bounds(p, without, [i for i in single if p.family(i) not in taken])
-            )
+            new = [i for i in single if p.family(i) not in taken]
+            trials.append(_inside_bounds(p, without, new))
         trials += [[*without, i] for i in every if p.place(i) == SHARED]
     return trials
 

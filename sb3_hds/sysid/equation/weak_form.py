@@ -15,7 +15,6 @@ from jaxtyping import Float
 from numpy.lib.stride_tricks import sliding_window_view
 
 from sb3_hds.sysid.equation.regression import TINY, Equation, Item
-from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Width of a bump, in periods of the joint's motion, and its least number of intervals.
 _WIDTH, _LEAST = 0.3, 6
@@ -71,12 +70,7 @@ class Rows(NamedTuple):
     narrowed: float
 
 
-def weak_rows(equation: Equation) -> list[Rows]:
-    """:return: of each joint"""
-    return [_joint(equation, j) for j in range(equation.missing.shape[1])]
-
-
-def rich_columns(items: list[Item], used: np.ndarray, joint: int | None = None) -> np.ndarray:
+def rich_columns(items: list[Item], used: np.ndarray) -> np.ndarray:
     """
     :return: places among ``used`` of the columns of a rich linear model, what it leaves being noise
     """
@@ -89,12 +83,13 @@ def rich_columns(items: list[Item], used: np.ndarray, joint: int | None = None) 
     return np.flatnonzero(np.isin(used, list(columns)))
 
 
-def _joint(equation: Equation, j: int) -> Rows:
+def weak_rows(equation: Equation, j: int) -> Rows:
+    """:return: rows of one joint"""
     columns, motion = equation.columns, equation.motion
-    pairs = [(i, values) for i, c in enumerate(columns) if (values := c.at(j)) is not None]
-    pairs = [(i, values) for i, values in pairs if np.abs(values).max() > 0.0]
-    used = np.array([i for i, _ in pairs], int)
-    table = np.stack([equation.missing[:, j], *(values for _, values in pairs)], 1)
+    acting = {i: values for i, c in enumerate(columns) if (values := c.at(j)) is not None}
+    acting = {i: values for i, values in acting.items() if np.abs(values).max() > 0.0}
+    used = np.array([*acting], int)
+    table = np.stack([equation.missing[:, j], *acting.values()], 1)
     rich = rich_columns(equation.items, used)
     period = motion.period[j] if np.isfinite(motion.period[j]) else 1.0
     widest = max(_WIDTH * period, _LEAST * motion.dt) / (2.0 * motion.dt)
@@ -170,35 +165,29 @@ def _against_bumps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """:return: sums against bumps a half width apart, and the middle of each"""
     phi = _bump(half)
-    rows, middles = [], []
+    rows, middles = [np.zeros((0, table.shape[1]))], [np.zeros(0, int)]
     for first in _begins(recording, left_out, half):
         stretch = table[first[0] : first[-1] + len(phi)]
         rows.append(sliding_window_view(stretch, len(phi), axis=0)[::half] @ phi)
         middles.append(first + half)
-    if not rows:
-        return np.zeros((0, table.shape[1])), np.zeros(0, int)
     return np.concatenate(rows), np.concatenate(middles)
 
 
 def _begins(recording: np.ndarray, left_out: np.ndarray, half: int) -> list[np.ndarray]:
-    """:return: where bumps begin, by stretch that has room for one"""
+    """:return: where bumps begin, by stretch of one recording that has room for one"""
     length = 2 * half + 1
-    runs = [run for run in _runs(recording, left_out) if run[1] - run[0] >= length]
-    return [np.arange(begin, end - length + 1, half) for begin, end in runs]
-
-
-def _runs(recording: np.ndarray, left_out: np.ndarray) -> list[tuple[int, int]]:
-    """:return: begin and end of stretches of one recording without anything left out"""
     cut = np.flatnonzero(np.diff(recording)) + 1
-    kept = ~left_out
-    edges = np.diff(np.concatenate([[0], kept.astype(int), [0]]))
+    edges = np.diff((~left_out).astype(int), prepend=0, append=0)
     begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    runs = []
+    found = []
     for begin, end in zip(begins, ends, strict=True):
-        inner = cut[(cut > begin) & (cut < end)]
-        bounds = [begin, *inner.tolist(), end]
-        runs += list(itertools.pairwise(bounds))
-    return runs
+        bounds = [begin, *cut[(cut > begin) & (cut < end)].tolist(), end]
+        found += [
+            np.arange(first, last - length + 1, half)
+            for first, last in itertools.pairwise(bounds)
+            if last - first >= length
+        ]
+    return found
 
 
 def _huber(y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, float]:
@@ -250,17 +239,15 @@ class Grams(NamedTuple):
     gain: Float[np.ndarray, " dof"]
     n_blocks: int
 
-    @property
-    def total(self) -> np.ndarray:
-        return self.by_joint.sum(0)
 
-
-def grams(equation: Equation, rows: list[Rows]) -> Grams:
+def grams(equation: Equation) -> Grams:
     """
+    Normal equations of :func:`weak_rows`.
+
     Blocks that agree less than their rows would: then each row counts as less than one, by the
     ratio of cluster-robust to naive variances of the rich model's coefficients.
     """
-    n_columns, dof = len(equation.columns), len(rows)
+    n_columns, dof = len(equation.columns), equation.missing.shape[1]
     pieces = max(1, -(-_BLOCKS // len(np.unique(equation.recording))))
     n_blocks = (int(equation.recording.max()) + 1) * pieces
     blocks = np.zeros((n_blocks, n_columns + 1, n_columns + 1))
@@ -271,7 +258,8 @@ def grams(equation: Equation, rows: list[Rows]) -> Grams:
     folds = np.zeros((n_folds, dof, n_columns + 1, n_columns + 1))
     effective, floor = np.full(dof, 5.0), np.zeros(dof)
     scale, gain = np.ones(dof), np.ones(dof)
-    for j, own in enumerate(rows):
+    for j in range(dof):
+        own = weak_rows(equation, j)
         scale[j], gain[j] = own.scale, own.gain
         if not len(own.y):
             continue
@@ -306,7 +294,3 @@ def _deflation(local: np.ndarray, rich: np.ndarray, most: float) -> float:
     n = len(local)
     free = n / max(n - int(well.sum()), n / 2)
     return float(np.clip(np.median(ratio) * free, 1.0, most))
-
-
-def is_parameter(item: Item) -> bool:
-    return item.candidate.slot == PARAMETER

@@ -10,7 +10,6 @@ from sb3_hds.core import ActionEffect, Effect, ExtendedTwin, ForceEffect, Sensor
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.effects import (
     ActionDelay,
-    ConstantForce,
     DryFriction,
     NeuralForce,
     SensorDelay,
@@ -66,6 +65,18 @@ class Candidate:
         """Name and place: unique."""
         return self.name if self.slot == PARAMETER else f"{self.name}.{self.place}"
 
+    @property
+    def full_names(self) -> dict[str, str]:
+        """Full names of its parameters by the short ones; the twin's own have no other name."""
+        if self.slot == PARAMETER:
+            return {self.place: self.place}
+        return {name.rpartition(".")[2]: name for name in self.parameters}
+
+    def moved_to(self, slot: str, place: str, index: int) -> "Candidate":
+        """:return: the same effect at another place"""
+        names = tuple(f"{self.name}.{place}.{short}" for short in self.full_names)
+        return dataclasses.replace(self, slot=slot, place=place, index=index, parameters=names)
+
     def resembles(self, other: "Candidate") -> str:
         """
         :return: when it is indistinguishable from another one, as declared by the effect; empty
@@ -85,11 +96,6 @@ def single_keys(keys: Collection[str], twin: Twin) -> set[str]:
         if name in (SignFlip.name, *_DERIVED):
             found |= {f"{name}.{channel.name}" for channel in twin.channels}
     return found
-
-
-def with_pushes(kept: Callable[[type[Effect], str], bool]) -> Callable[[type[Effect], str], bool]:
-    """Constant forces serve to measure what force is missing."""
-    return lambda kind, place: kind is ConstantForce or kept(kind, place)
 
 
 def options_for(
@@ -123,22 +129,20 @@ def attach(
             if f"{kind.name}.{place.name}" not in there and kept(kind, place.name):
                 wanted.append(kind(i, **options(kind, i)))
     extended = twin.extend(*wanted) if wanted else twin
-    candidates = []
-    for a in attached_of(extended):
-        if isinstance(a.effect, NeuralForce):
-            continue
-        candidates.append(
-            Candidate(
-                a.effect.name,
-                a.effect.slot,
-                places[a.effect.slot][a.index].name,
-                a.index,
-                tuple(f"{a.key}.{name}" for name in a.effect.parameters),
-                a.effect.explanation,
-                tuple(a.effect.equivalents.items()),
-                tuple(f"{a.key}.{name}" for name in a.effect.ascending),
-            )
+    candidates = [
+        Candidate(
+            a.effect.name,
+            a.effect.slot,
+            places[a.effect.slot][a.index].name,
+            a.index,
+            tuple(f"{a.key}.{name}" for name in a.effect.parameters),
+            a.effect.explanation,
+            tuple(a.effect.equivalents.items()),
+            tuple(f"{a.key}.{name}" for name in a.effect.ascending),
         )
+        for a in attached_of(extended)
+        if not isinstance(a.effect, NeuralForce)
+    ]
     if SignFlip in effects:
         candidates += _reversed_joints(twin)
     return extended, candidates + _shared(twin, candidates)
@@ -150,9 +154,7 @@ def _shared(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]:
     for name in _SHARED:
         own = [c for c in candidates if c.name == name and c.slot == "actuator"]
         if len(own) > 1 and len(own) == len(twin.actuators):
-            tie = f"{name}.{EVERY}"
-            names = tuple(f"{tie}.{p.rpartition('.')[2]}" for p in own[0].parameters)
-            found.append(dataclasses.replace(own[0], place=EVERY, index=-1, parameters=names))
+            found.append(own[0].moved_to("actuator", EVERY, -1))
     return found
 
 
@@ -165,11 +167,7 @@ def _of_encoders(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]
             if encoder.velocity is None or not {*encoder.channels} <= {c.index for c in own}:
                 continue
             (first,) = (c for c in own if c.index == encoder.position)
-            place = twin.joints[j].name
-            names = tuple(f"{name}.{place}.{p.rpartition('.')[2]}" for p in first.parameters)
-            found.append(
-                dataclasses.replace(first, slot="joint", place=place, index=j, parameters=names)
-            )
+            found.append(first.moved_to("joint", twin.joints[j].name, j))
     return found
 
 
@@ -180,16 +178,15 @@ def ties_of(
     found = {}
     for shared in candidates:
         if shared.place == EVERY:
-            own = [c for c in single if c.name == shared.name and c.slot == "actuator"]
+            own = [c for c in single if (c.name, c.slot) == (shared.name, "actuator")]
             own = [c for c in own if c.place != EVERY]
         elif shared.slot == "joint" and shared.name in _DERIVED:
             channels = encoders(twin)[shared.index].channels
-            own = [c for c in single if c.name == shared.name and c.slot == "channel"]
+            own = [c for c in single if (c.name, c.slot) == (shared.name, "channel")]
             own = [c for c in own if c.index in channels]
         else:
             continue
-        for name in shared.parameters:
-            short = name.rpartition(".")[2]
+        for short, name in shared.full_names.items():
             found[name] = tuple(f"{c.key}.{short}" for c in own)
     return found
 
@@ -209,14 +206,15 @@ def _reversed_joints(twin: Twin) -> list[Candidate]:
 
 
 def has_memory(effect: Effect, twin: Twin) -> bool:
+    """:return: whether it remembers earlier states, commands or readings"""
     if isinstance(effect, SensorEffect):
         return bool(jax.tree.leaves(effect.memory(jnp.zeros(()), twin)))
-    return isinstance(effect, ForceEffect | ActionEffect) and bool(
-        jax.tree.leaves(effect.memory(twin))
-    )
+    acts = isinstance(effect, ForceEffect | ActionEffect)
+    return acts and bool(jax.tree.leaves(effect.memory(twin)))
 
 
 def attached_of(twin: Twin) -> tuple:
+    """:return: effects with their places; none of a twin that is not extended"""
     layer = extended_of(twin)
     return layer.attached if layer else ()
 
