@@ -117,6 +117,12 @@ def union(answers: Sequence[Answer]) -> tuple[Twin, np.ndarray, np.ndarray]:
     return twin, values, factor
 
 
+def bounds_of(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
+    """:return: smallest and largest values of all parameters, each of shape ``(p,)``"""
+    parameters = twin.parameters.values()
+    return np.array([p.lower for p in parameters]), np.array([p.upper for p in parameters])
+
+
 def effects_of(twin: Twin) -> tuple[Effect, ...]:
     """:return: the effects that are attached, holding their values"""
     extended = (layer for layer in layers_of(twin) if isinstance(layer, ExtendedTwin))

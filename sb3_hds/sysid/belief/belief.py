@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from sb3_hds.core.belief import BeliefTwin
 from sb3_hds.core.trajectories.storage import check_target, write_bytes
-from sb3_hds.sysid.belief.answers import Answers, union
+from sb3_hds.sysid.belief.answers import Answers, bounds_of, union
 
 # How often a draw out of its physical bounds is drawn again before it is moved to them.
 _TRIES = 50
@@ -33,20 +33,15 @@ def belief_of(answers: Answers, n: int = 64, seed: int = 0) -> BeliefTwin:
     :return: one twin with everything that any answer has; draw 0 is the likeliest answer as fitted
     """
     twin, values, factor = union(answers.answers)
-    rng, bounds = np.random.default_rng(seed), list(twin.parameters.values())
-    low, high = (np.array([getattr(p, end) for p in bounds]) for end in ("lower", "upper"))
-    origin = _shares(answers.weights, n)
-    draws = np.stack([_drawn(rng, values[m], factor[m], low, high) for m in origin])
+    rng, bounds = np.random.default_rng(seed), bounds_of(twin)
+    # The likeliest answer takes what the others leave.
+    counts = np.maximum(np.round(answers.weights * n).astype(int), 1)
+    counts[0] = max(n - counts[1:].sum(), 1)
+    origin = np.repeat(np.arange(len(counts)), counts)
+    draws = np.stack([_drawn(rng, values[m], factor[m], *bounds) for m in origin])
     draws[0] = values[0]
     names = [answer.name for answer in answers.answers]
     return BeliefTwin(twin, draws, origin, names, tuple(answers.weights))
-
-
-def _shares(weights: Float[np.ndarray, " m"], n: int) -> np.ndarray:
-    """:return: number of the answer of each draw, ascending; the likeliest takes what is left"""
-    counts = np.maximum(np.round(weights * n).astype(int), 1)
-    counts[0] = max(n - counts[1:].sum(), 1)
-    return np.repeat(np.arange(len(weights)), counts)
 
 
 def _drawn(

@@ -26,7 +26,7 @@ from jaxtyping import Array
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.trajectories.episodes import same_interval
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.belief.answers import Answer, Answers, union
+from sb3_hds.sysid.belief.answers import Answer, Answers, bounds_of, union
 from sb3_hds.sysid.estimation.shooting import (
     Shots,
     n_free,
@@ -72,8 +72,7 @@ def updated(answers: Answers, data: Trajectories, window: int | None = None) -> 
         )
     length = min(window or answers.window, int(data.lengths.max()))
     shots, _ = shots_of(data, length, twin)
-    low = np.array([p.lower for p in twin.parameters.values()])
-    high = np.array([p.upper for p in twin.parameters.values()])
+    low, high = bounds_of(twin)
     with jax.enable_x64(True):
         fit = jax.jit(partial(_fitted, twin, shots, answers.noise, answers.correlated))
         fitted = [jax.tree.map(np.asarray, fit(*one)) for one in zip(values, factor, strict=True)]

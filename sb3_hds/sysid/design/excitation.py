@@ -20,7 +20,7 @@ two rival models*, Biometrika 62(1), 1975, with the prior of Ponce de Leon and A
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -153,29 +153,18 @@ class Excitation:
             slopes, told = jax.vmap(jax.jacfwd(cost, has_aux=True))(coefficients)
         return told[0], told[1], slopes
 
-    def _between(
-        self, a: Any, b: Any, states: State, outputs: Array, actions: Array, asked: Question
-    ) -> tuple[Array, Array, Array]:
-        """What answer ``b`` leaves of what ``a`` predicts, scores and curvature by ``z``."""
-        mine, theirs = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in (a, b))
-        values, factor = jnp.asarray(asked.values[b]), jnp.asarray(asked.factor[b])
-        weight = jnp.asarray(asked.weight)
-
-        def one(mine: State, theirs: State, seen: Array, commands: Array) -> tuple[Array, ...]:
-            return self._normal(mine, theirs, seen, commands, values, factor, weight)
-
-        found = jax.vmap(one)(mine, theirs, outputs[a], actions)
-        rest, score, curvature = (jnp.sum(x, 0) / asked.correlated for x in found)
-        return rest, score, curvature
-
     def _told(self, actions: Float[Array, "n steps act"], asked: Question) -> Told:
         states, outputs, usage = self._rollouts(actions, asked)
         m = len(asked.values)
 
         def of(pair: Array) -> tuple[Array, Array, Array]:
-            rest, score, curvature = self._between(
-                pair[0], pair[1], states, outputs, actions, asked
-            )
+            """What answer ``b`` leaves of what ``a`` predicts, and what it says of ``b``."""
+            a, b = pair
+            mine, theirs = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in (a, b))
+            own = (jnp.asarray(asked.values[b]), jnp.asarray(asked.factor[b]))
+            normal = partial(self._normal, *own, jnp.asarray(asked.weight))
+            found = jax.vmap(normal)(mine, theirs, outputs[a], actions)
+            rest, score, curvature = (jnp.sum(x, 0) / asked.correlated for x in found)
             bread = curvature + jnp.eye(len(curvature), dtype=curvature.dtype)
             moved = jnp.linalg.solve(bread, score)
             return rest - score @ moved, 0.5 * jnp.linalg.slogdet(bread)[1], curvature
@@ -241,13 +230,13 @@ class Excitation:
 
     def _normal(
         self,
+        values: Array,
+        factor: Array,
+        weight: Array,
         mine: State,
         theirs: State,
         seen: Array,
         commands: Array,
-        values: Array,
-        factor: Array,
-        weight: Array,
     ) -> tuple[Array, Array, Array]:
         """
         One recording under answer ``b``, in windows that begin where answer ``a`` is.

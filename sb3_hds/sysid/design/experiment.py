@@ -18,9 +18,16 @@ from rich.progress import track
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.effects import ConstantForce
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.belief.answers import Answers, effect_key, effects_of, everything_open, union
+from sb3_hds.sysid.belief.answers import (
+    Answers,
+    bounds_of,
+    effect_key,
+    effects_of,
+    everything_open,
+    union,
+)
 from sb3_hds.sysid.design.excitation import Excitation, Question
-from sb3_hds.sysid.design.limits import Limits
+from sb3_hds.sysid.design.limits import BY_JOINT, Limits
 from sb3_hds.sysid.design.result import SURE, NextExperiment, Pair
 from sb3_hds.sysid.reporting.wording import with_unit
 
@@ -76,11 +83,8 @@ def next_experiment(
         would_tell = ()
         if not decides:
             would_tell = _would_tell(excitation, actions, asked, told.outputs, loads)
-        narrower = (
-            {} if len(answers.answers) > 1 else _narrower(excitation.twin, asked, told.curvature)
-        )
-    n_obs = len(twin.channels)
-    outputs = told.outputs[..., :n_obs]
+    alone = len(answers.answers) == 1
+    outputs = told.outputs[..., : len(twin.channels)]
     return NextExperiment(
         commands=Trajectories.from_arrays(
             outputs[0], actions, dt=twin.dt, conditions="designed experiment"
@@ -91,7 +95,7 @@ def next_experiment(
         actuators=tuple((a.name, a.unit) for a in twin.actuators),
         pairs=pairs,
         information=float(told.gains[0]),
-        narrower=narrower,
+        narrower=_narrower(twin, asked, told.curvature) if alone else {},
         usage=_usage(told.usage, twin),
         decides=decides,
         would_tell=would_tell,
@@ -162,9 +166,8 @@ def _with_loads(
 
 def _corners(twin: Twin, values: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """Parameters at two standard deviations along the widest directions, within their bounds."""
-    scale = np.array([p.scale for p in twin.parameters.values()])
-    low = np.array([p.lower for p in twin.parameters.values()])
-    high = np.array([p.upper for p in twin.parameters.values()])
+    (low, high), parameters = bounds_of(twin), twin.parameters.values()
+    scale = np.array([p.scale for p in parameters])
     found = []
     for value, own in zip(values, factor, strict=True):
         widest = np.argsort(-np.linalg.norm(own / scale[:, None], axis=0))[:_DIRECTIONS]
@@ -290,10 +293,9 @@ def _narrower(twin: Twin, asked: Question, curvature: np.ndarray) -> dict[str, t
 
 
 def _usage(usage: np.ndarray, twin: Twin) -> dict[str, float]:
-    limits = ("position", "velocity", "torque", "power", "jerk")
     return {
         f"{limit} of {joint.name}": float(usage[i, j])
-        for i, limit in enumerate(limits)
+        for i, limit in enumerate(("position", *BY_JOINT))
         for j, joint in enumerate(twin.joints)
         if usage[i, j] > 0.0
     }

@@ -12,15 +12,8 @@ from sb3_hds.core import AnalyticTwin, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.errors import ParameterError, did_you_mean
 
-#: quantities whose largest absolute value is limited at each joint, and their units where a joint
-#: turns and where it slides
-BY_JOINT = {
-    "velocity": ("rad/s", "m/s"),
-    "torque": ("N m", "N"),
-    "power": ("W", "W"),
-    "jerk": ("rad/s3", "m/s3"),
-}
-_PAIRS = ("position", "command")
+#: quantities whose largest absolute value is limited at each joint
+BY_JOINT = ("velocity", "torque", "power", "jerk")
 
 Given = float | Sequence[float] | Mapping[str, Any]
 
@@ -93,10 +86,10 @@ class Limits:
                 f"{twin.name} does not compute the force of its actuators, so it cannot keep a "
                 f"limit of {' and '.join(needs_force)}. Limit the command instead."
             )
-        position = [(j.low, j.high) for j in twin.joints]
-        command = [(a.low, a.high) for a in twin.actuators]
-        position = _pairs("position", self.position, joints, position)
-        command = _pairs("command", self.command, actuators, command)
+        ranges = [(j.low, j.high) for j in twin.joints]
+        position = _pairs("position", self.position, joints, ranges)
+        ranges = [(a.low, a.high) for a in twin.actuators]
+        command = _pairs("command", self.command, actuators, ranges)
         for name, (low, high) in zip(actuators, command, strict=True):
             if not (math.isfinite(low) and math.isfinite(high)):
                 raise ParameterError(
@@ -146,8 +139,6 @@ def _pairs(
     limit: str, given: Given | None, names: list[str], default: list[tuple[float, float]]
 ) -> np.ndarray:
     found = np.array(default, float)
-    if given is None:
-        return found
     for i, own in _by_name(limit, given, names):
         own = (-own, own) if _is_number(own) else own
         pair = isinstance(own, Sequence) and len(own) == 2 and all(map(_is_number, own))
@@ -167,8 +158,6 @@ def _pairs(
 
 def _largest(limit: str, given: Given | None, names: list[str]) -> np.ndarray:
     found = np.full(len(names), np.inf)
-    if given is None:
-        return found
     for i, own in _by_name(limit, given, names):
         if not (_is_number(own) and own > 0.0):
             raise ParameterError(
@@ -178,7 +167,10 @@ def _largest(limit: str, given: Given | None, names: list[str]) -> np.ndarray:
     return found
 
 
-def _by_name(limit: str, given: Given, names: list[str]) -> list[tuple[int, Any]]:
+def _by_name(limit: str, given: Given | None, names: list[str]) -> list[tuple[int, Any]]:
+    """:return: index and value of each joint or actuator that has a limit"""
+    if given is None:
+        return []
     if not isinstance(given, Mapping):
         return [(i, given) for i in range(len(names))]
     unknown = [str(name) for name in given if name not in names]

@@ -1,13 +1,13 @@
 """Estimate the parameters of a twin from measured data."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core import Parameter, Trajectories, Twin
+from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.core.numerics.kept_programs import keep_programs
 from sb3_hds.core.trajectories.episodes import same_interval
@@ -34,7 +34,7 @@ _PASSES = 3
 _FIRST_STEPS, _LEAST_STEP = 8, 1e-3
 # An estimate this close to a bound lies on it, in units of its scale.
 _ON_BOUND = 1e-3
-# Beyond this ratio of two intervals, one is taken to be in another unit.
+# From this ratio of two intervals on, one is taken to be in another unit.
 _OTHER_UNIT = 100.0
 
 
@@ -149,8 +149,15 @@ def fit_windows(
         err by more than a channel's standard deviation
     :raises CalibrationError: for fewer measurements than unknowns
     """
-    _check_enough(twin, free, shots)
     real = origin >= 0
+    n, steps = int(np.sum(shots.weight)), shots.actions.shape[1]
+    measured, unknown = n * int(np.prod(shots.obs.shape[1:])), len(free) + n * n_free(twin)
+    if measured <= unknown:
+        raise CalibrationError(
+            f"{n} windows of {steps} steps hold {measured} measurements, and {len(free)} "
+            f"parameters with the start states are {unknown} unknowns. Record more, free fewer "
+            "parameters, or ask for longer windows."
+        )
     kept, origin = Shots(*(np.asarray(leaf)[real] for leaf in shots)), origin[real]
     evidence = Evidence(
         Hypotheses.of_values(twin, free, believed, prior),
@@ -179,8 +186,8 @@ def fit_windows(
     uncertainty = covariance_of(
         slopes.curvature.sum(0), slopes.scores, origin, scale, prior, n_measured
     )
-    told = _Told(before, at.raw, noise, found.converged, found.n_steps, "simulation")
-    return _result(twin, free, at.theta, uncertainty, told, level)
+    solver = {"noise": noise, "converged": found.converged, "n_steps": found.n_steps}
+    return _result(twin, free, at.theta, uncertainty, level, (before, at.raw), **solver)
 
 
 def _fit_forces(
@@ -223,8 +230,8 @@ def _fit_forces(
         for values in (own_values(twin, free), found.values)
     )
     noise = _noise(after, 0, n_free(twin), spread)
-    told = _Told(before, after, noise, True, 1, "force")
-    return _result(twin, free, found.values, uncertainty, told, level)
+    solver = {"noise": noise, "converged": True, "n_steps": 1, "errors": "force"}
+    return _result(twin, free, found.values, uncertainty, level, (before, after), **solver)
 
 
 def _rms(raw: np.ndarray) -> np.ndarray:
@@ -259,35 +266,19 @@ def check_fits(twin: Twin, data: Trajectories) -> None:
     if misfit:
         raise CalibrationError(misfit)
     if not same_interval(data.dt, twin.dt):
+        unit = ""
+        if data.dt / twin.dt >= _OTHER_UNIT:
+            order = int(np.clip(round(np.log10(data.dt / twin.dt) / 3.0), 1, 3))
+            unit = (
+                f"The column of time may be in {('milli', 'micro', 'nano')[order - 1]}seconds: "
+                "then say so in the map of columns, "
+                f"time: {{column: NAME, scale: {10.0 ** (-3 * order):g}}}. Otherwise: "
+            )
         raise CalibrationError(
             f"{twin.name} steps by {twin.dt:g} s and the data are sampled every {data.dt:g} s. "
-            f"{_other_unit(data.dt / twin.dt)}Use data.resample(dt={twin.dt:g}) (in the map of "
+            f"{unit}Use data.resample(dt={twin.dt:g}) (in the map of "
             f"columns, dt: {twin.dt:g}), or make the twin with dt={data.dt:g} (on the command "
             f"line, --set dt:{data.dt:g})."
-        )
-
-
-def _other_unit(ratio: float) -> str:
-    """What to do where stamps were taken for seconds that are thousands of times shorter."""
-    if ratio < _OTHER_UNIT:
-        return ""
-    order = int(np.clip(round(np.log10(ratio) / 3.0), 1, 3))
-    unit = ("milliseconds", "microseconds", "nanoseconds")[order - 1]
-    return (
-        f"The column of time may be in {unit}: then say so in the map of columns, "
-        f"time: {{column: NAME, scale: {10.0 ** (-3 * order):g}}}. Otherwise: "
-    )
-
-
-def _check_enough(twin: Twin, free: Free, shots: Shots) -> None:
-    real = int(np.sum(shots.weight))
-    measured = real * int(np.prod(shots.obs.shape[1:]))
-    unknown = len(free) + real * n_free(twin)
-    if measured <= unknown:
-        raise CalibrationError(
-            f"{real} windows of {shots.actions.shape[1]} steps hold {measured} measurements, and "
-            f"{len(free)} parameters with the start states are {unknown} unknowns. "
-            "Record more, free fewer parameters, or ask for longer windows."
         )
 
 
@@ -301,77 +292,57 @@ def _noise(
     return np.maximum(noise, _LEAST_NOISE * spread)
 
 
-class _Told(NamedTuple):
-    """What a fit is told with: errors of simulations, shape ``(n, rows, n_obs)``, and the rest."""
-
-    before: np.ndarray
-    after: np.ndarray
-    noise: np.ndarray
-    converged: bool
-    n_steps: int
-    errors: str
-
-
 def _result(
     twin: Twin,
     free: Free,
     values: np.ndarray,
     spread: Spread,
-    told: _Told,
     level: float,
+    raw: tuple[np.ndarray, np.ndarray],
+    **solver: Any,
 ) -> Fit:
+    """
+    :param raw: errors of simulations before and after, each of shape ``(n, rows, n_obs)``
+    :param solver: what :class:`Fit` says of the solver, and the noise
+    """
     groups = tuple(free.values())
-    parameters = [twin.parameters[group[0]] for group in groups]
     margin = spread.quantile(level) * spread.stderr
-    estimates = tuple(
-        Estimate(
-            name=name,
-            estimate=float(value),
-            stderr=float(stderr),
-            low=float(max(value - half, parameter.lower)),
-            high=float(min(value + half, parameter.upper)),
-            unit=parameter.unit,
-            before=twin.values[group[0]],
-            at_bound=bool(at_bound),
+    estimates = []
+    for (name, group), x, stderr, half in zip(
+        free.items(), values, spread.stderr, margin, strict=True
+    ):
+        parameter = twin.parameters[group[0]]
+        room = min(x - parameter.lower, parameter.upper - x)
+        estimates.append(
+            Estimate(
+                name=name,
+                estimate=float(x),
+                stderr=float(stderr),
+                low=float(max(x - half, parameter.lower)),
+                high=float(min(x + half, parameter.upper)),
+                unit=parameter.unit,
+                before=twin.values[group[0]],
+                at_bound=bool(room < _ON_BOUND * parameter.scale),
+            )
         )
-        for (name, group), parameter, value, stderr, half, at_bound in zip(
-            free.items(),
-            parameters,
-            values,
-            spread.stderr,
-            margin,
-            _at_bound(parameters, values),
-            strict=True,
-        )
-    )
+    before, after = raw
     return Fit(
         twin=twin.with_parameters(**one_each(groups, values.tolist())),
-        estimates=estimates,
+        estimates=tuple(estimates),
         covariance=spread.covariance,
         channels=tuple((channel.name, channel.unit) for channel in twin.channels),
-        error_before=_rms(told.before),
-        error_after=_rms(told.after),
-        noise=told.noise,
-        n_windows=len(told.after),
-        window=told.after.shape[1] - 1,
+        error_before=_rms(before),
+        error_after=_rms(after),
+        n_windows=len(after),
+        window=after.shape[1] - 1,
         n_groups=spread.n_groups,
         level=level,
-        converged=told.converged,
-        n_steps=told.n_steps,
-        undetermined=tuple(_in_words(tuple(free), row) for row in spread.undetermined),
-        errors=told.errors,
+        undetermined=tuple(_combination(tuple(free), row) for row in spread.undetermined),
+        **solver,
     )
 
 
-def _at_bound(parameters: Sequence[Parameter], values: np.ndarray) -> list[bool]:
-    """Whether values lie on a physical bound."""
-    return [
-        bool(min(value - p.lower, p.upper - value) < _ON_BOUND * p.scale)
-        for p, value in zip(parameters, values, strict=True)
-    ]
-
-
-def _in_words(names: tuple[str, ...], direction: np.ndarray) -> str:
+def _combination(names: tuple[str, ...], direction: np.ndarray) -> str:
     """Which parameters a direction that the data do not determine consists of."""
     share = np.abs(direction)
     return ", ".join(names[i] for i in np.argsort(-share) if share[i] > 0.1)

@@ -5,7 +5,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
@@ -43,7 +43,7 @@ _PORTION, _ROUND = 64, 8
 # Steps of all windows, or joints, beyond which a second program, for start states alone, is worth
 # compiling: 8 s for one joint with all its effects, as 50 passes over so many steps take.
 _MANY_STEPS, _MANY_JOINTS = 60_000, 3
-# Held by programs that must not run beside another one.
+# Held by programs that call LAPACK, which must not run beside one another.
 _LAPACK = threading.Lock()
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
@@ -281,7 +281,8 @@ class Evidence:
         filled[:n] = offsets
         slopes = []
         for own in _in_groups(index, self._width_for(index), len(theta)):
-            with jax.enable_x64(True), _alone(len(h.twin.joints)):
+            alone = _LAPACK if uses_lapack(len(h.twin.joints)) else nullcontext()
+            with jax.enable_x64(True), alone:
                 found = _look(
                     h.twin,
                     h.names,
@@ -300,11 +301,6 @@ class Evidence:
             slopes.append(by_theta)
         by_theta = np.concatenate(slopes, -1)[..., : len(index)]
         return normal_equations(raw, by_start, by_theta, self.noise, self._counted, self.threshold)
-
-
-def _alone(n: int) -> AbstractContextManager:
-    """For programs that solve matrices of so many rows."""
-    return _LAPACK if uses_lapack(n) else nullcontext()
 
 
 def in_threads(work: Callable[[_Given], _Told], given: Sequence[_Given]) -> Iterator[_Told]:

@@ -25,10 +25,11 @@ from sb3_hds.sysid.estimation.candidates import (
     options_for,
     single_keys,
     ties_of,
-    with_pushes,
 )
 from sb3_hds.sysid.estimation.parameters import Belief, Free, prior_of
 from sb3_hds.sysid.estimation.shooting import remembered_for, remembers_for
+
+_OF_PARAMETER = "The twin's {} is not that of the system."
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -102,18 +103,16 @@ class Hypotheses:
                 f"calibrate names {', '.join(unknown)}, which {twin.name} does not have. "
                 f"Its parameters are: {', '.join(twin.parameters) or 'none'}."
             )
-        own = tuple(name for name in twin.parameters if not name.endswith(".share"))
-        known = twin.known_parameters
         pushed = () if ConstantForce in effects else (ConstantForce,)
         rivals = tuple(kind for kind in NAMELESS if kind not in effects)
         wanted = None if only is None else single_keys(only, twin)
-        kept = lambda kind, place: (  # noqa: E731
-            (nameless_at is None or place in nameless_at)
-            if kind in rivals
-            else wanted is None or kind in pushed or f"{kind.name}.{place}" in wanted
-        )
-        if wanted is not None and ConstantForce in effects:
-            kept = with_pushes(kept)
+
+        def kept(kind: type[Effect], place: str) -> bool:
+            if kind in rivals:
+                return nameless_at is None or place in nameless_at
+            # Constant forces serve to measure the residual force.
+            return wanted is None or kind is ConstantForce or f"{kind.name}.{place}" in wanted
+
         options = partial(options_for, period, speeds)
         extended, found = attach(twin, (*effects, *pushed, *rivals), kept, options)
         nameless = tuple(c for c in found if c.name in {kind.name for kind in rivals})
@@ -125,8 +124,8 @@ class Hypotheses:
         there = {name for c in found for name in c.parameters}
         candidates = [
             Candidate(f"parameter.{name}", PARAMETER, name, i, (name,), _OF_PARAMETER.format(name))
-            for i, name in enumerate(own)
-            if name not in {*calibrate, *native.values(), *there, *known}
+            for i, name in enumerate(n for n in twin.parameters if not n.endswith(".share"))
+            if name not in {*calibrate, *native.values(), *there, *twin.known_parameters}
         ]
         candidates += [
             c
@@ -143,16 +142,14 @@ class Hypotheses:
         values = np.array([extended.values[ties.get(name, (name,))[0]] for name in moving], float)
         lower = np.array([every[name].lower for name in moving], float)
         for i, name in enumerate(moving):
-            if name in native:
+            if name in native and every[name].null == 0.0:
                 # The twin has some of it already: there may be less than it believes.
-                target = native[name]
-                if every[name].null == 0.0:
-                    lower[i] = twin.parameters[target].lower - twin.values[target]
+                lower[i] = twin.parameters[native[name]].lower - twin.values[native[name]]
         upper = np.array([every[name].upper for name in moving], float)
         prior = np.full(len(moving), np.inf)
         for i, (name, belief) in enumerate(beliefs.items()):
-            own_prior = prior_of(name, twin.parameters[name], twin.values[name], belief)
-            prior[i], lower[i], upper[i] = own_prior
+            own = twin.parameters[name], twin.values[name]
+            prior[i], lower[i], upper[i] = prior_of(name, *own, belief)
         return cls(
             believed=twin,
             twin=extended,
@@ -259,12 +256,12 @@ class Hypotheses:
     def effect_of(self, candidate: Candidate) -> Effect | None:
         """:return: the effect that the candidate is; None for a parameter, or several effects"""
         shared = bool({*candidate.parameters} & {*self.ties})
-        found = [
+        found = (
             a.effect
             for a in attached_of(self.twin)
             if a.key == candidate.key or (shared and a.effect.name == candidate.name)
-        ]
-        return found[0] if found else None
+        )
+        return next(found, None)
 
     def remembers(self, candidate: Candidate) -> bool:
         """:return: whether it has memory of earlier states or commands"""
@@ -313,7 +310,7 @@ class Hypotheses:
         singles = [single for name in names for single in self.ties.get(name, (name,))]
         own = {self.names[i]: value[self.names[i]] for i in self.nuisances}
         native = native_targets(self.believed, chosen)
-        for name in (name for c in chosen for name in c.parameters):
+        for name in names:
             if name in native:
                 own[native[name]] = with_native(
                     self.believed.values[native[name]], value[name], self.twin.parameters[name]
@@ -335,6 +332,3 @@ class Hypotheses:
     def place_of(self, candidate: Candidate) -> dict[str, str | int]:
         """:return: where it is, as plain data"""
         return {"slot": candidate.slot, "index": candidate.index, "name": candidate.place}
-
-
-_OF_PARAMETER = "The twin's {} is not that of the system."

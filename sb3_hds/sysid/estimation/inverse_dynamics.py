@@ -96,7 +96,7 @@ def by_inverse_dynamics(
             errors, table = weight * missing, weight[..., None] * slopes
             if step == _STEPS:
                 break
-            belief = np.diag(np.full(len(groups), 1.0 / _BELIEF))
+            belief = np.eye(len(groups)) / _BELIEF
             whole = np.concatenate([table.reshape(-1, len(groups)) * scale, belief])
             right = np.concatenate([-errors.ravel(), (own - values) / scale / _BELIEF])
             room = (lower - values) / scale, (upper - values) / scale
@@ -105,17 +105,15 @@ def by_inverse_dynamics(
 
 
 def _weights(missing: np.ndarray, threshold: float) -> np.ndarray:
-    noise = _NORMAL * np.median(np.abs(missing), 0)
-    noise = np.maximum(noise, 1e-12 * np.abs(missing).max() + 1e-300)
-    return np.sqrt(np.minimum(1.0, threshold * noise / np.maximum(np.abs(missing), 1e-300))) / noise
+    size = np.abs(missing)
+    noise = np.maximum(_NORMAL * np.median(size, 0), 1e-12 * size.max() + 1e-300)
+    return np.sqrt(np.minimum(1.0, threshold * noise / np.maximum(size, 1e-300))) / noise
 
 
 def _within(table: np.ndarray, right: np.ndarray, room: tuple[np.ndarray, np.ndarray]) -> Any:
     """Least squares between bounds, of which one that stands on the other leaves no room."""
     low, high = room
-    fixed = high - low < 1e-12
-    found = np.zeros(len(low))
-    free = ~fixed
+    found, free = np.zeros(len(low)), high - low >= 1e-12
     if free.any():
         found[free] = scipy.optimize.lsq_linear(table[:, free], right, (low[free], high[free])).x
     return found

@@ -37,10 +37,7 @@ def window_errors(
     :param scale: what an error of one means in each channel
     :return: errors in units of ``scale``, shape ``(n,)``; infinite where a simulation is not finite
     """
-    with jax.enable_x64(True):
-        doubles = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
-        found = _errors(twin, doubles, Shots(*map(jnp.asarray, shots)), jnp.asarray(scale))[0]
-        return np.asarray(found)
+    return _in_double_precision(twin, params, shots, scale)[0]
 
 
 def start_states(
@@ -50,11 +47,17 @@ def start_states(
     :return: of each window, the start state under which the twin comes closest to it, and an
         orthonormal basis of the errors (in units of ``scale``, flattened) that moving it can make
     """
+    _, offsets, slopes = _in_double_precision(twin, params, shots, scale)
+    return offsets, np.linalg.qr(np.nan_to_num(slopes, posinf=0.0, neginf=0.0))[0]
+
+
+def _in_double_precision(
+    twin: Twin, params: Params, shots: Shots, scale: Float[np.ndarray, " obs"]
+) -> tuple[np.ndarray, ...]:
     with jax.enable_x64(True):
         doubles = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
         found = _errors(twin, doubles, Shots(*map(jnp.asarray, shots)), jnp.asarray(scale))
-        slopes = np.nan_to_num(np.asarray(found[2]), posinf=0.0, neginf=0.0)
-        return np.asarray(found[1]), np.linalg.qr(slopes)[0]
+        return tuple(map(np.asarray, found))
 
 
 def single_step_errors(

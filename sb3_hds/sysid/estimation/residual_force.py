@@ -163,12 +163,18 @@ def fit_force(
             f"{real.sum()} windows are too few to learn from some and check on others. "
             "Record more, or ask for shorter windows."
         )
-    has_force = force_of(twin) is not None
-    extended, key = _with_force(twin, n_members, net_arch, caution)
+    extended = twin
+    if force_of(twin) is None:
+        fresh = NeuralForce(0, n_members=n_members, net_arch=net_arch, caution=caution)
+        extended = twin.extend(fresh)
+    attached = force_of(extended)
+    assert attached is not None
+    key, force = attached
     without = {**extended.params, f"{key}.share": 0.0}
-    tensors = _own(extended, key)
-    if not has_force:
-        tensors = _normalised(extended, key, shots, learned, seed)
+    seen = _seen(extended, Shots(*(leaf[learned] for leaf in shots)))
+    tensors = {name: extended.tensors[f"{key}.{name}"] for name in force.tensors}
+    if extended is not twin:
+        tensors = _normalised(extended, force, seen, seed)
     params, n_steps = without, 0
     for _ in range(_ROUNDS):
         starts = start_states(extended, params, shots, scale)
@@ -180,32 +186,9 @@ def fit_force(
     after = window_errors(extended, params, shots, scale)[held]
     accepted = is_better(after, before)
     extended = extended.with_parameters(**{f"{key}.share": 1.0 if accepted else 0.0})
-    doubt = _mean_disagreement(extended, key, shots, learned)
+    disagree = lambda q, v, u: force.disagreement(q, v, u, tensors)  # noqa: E731
+    doubt = float(jnp.mean(jax.vmap(jax.vmap(disagree))(*seen)))
     return Residual(extended, key, accepted, before, after, n_steps, doubt)
-
-
-def _with_force(
-    twin: Twin, n_members: int, net_arch: Sequence[int], caution: float
-) -> tuple[Twin, str]:
-    if force_of(twin) is None:
-        twin = twin.extend(NeuralForce(0, n_members=n_members, net_arch=net_arch, caution=caution))
-    found = force_of(twin)
-    assert found is not None
-    return twin, found[0]
-
-
-def _command(twin: Twin, state: State, action: Array, params: dict[str, Any]) -> Array:
-    """What the plant is told, below the wrappers."""
-    for layer in layers_of(twin):
-        if isinstance(layer, TransformedTwin):
-            action = layer.command(state, action, params)
-    return action
-
-
-def _own(twin: Twin, key: str) -> dict[str, Any]:
-    found = force_of(twin)
-    assert found is not None
-    return {name: twin.tensors[f"{key}.{name}"] for name in found[1].tensors}
 
 
 def _seen(twin: Twin, shots: Shots) -> tuple[Array, Array, Array]:
@@ -215,7 +198,10 @@ def _seen(twin: Twin, shots: Shots) -> tuple[Array, Array, Array]:
 
     def one(obs: Array, action: Array) -> tuple[Array, Array, Array]:
         state: State = twin.infer(obs, params)
-        force = plant.actuate(state, _command(twin, state, action, params), params)
+        for layer in layers_of(twin):
+            if isinstance(layer, TransformedTwin):
+                action = layer.command(state, action, params)
+        force = plant.actuate(state, action, params)
         return plant.coordinates(state.q), state.v, force
 
     obs = jnp.asarray(shots.obs[:, :-1], jnp.float32)
@@ -223,22 +209,19 @@ def _seen(twin: Twin, shots: Shots) -> tuple[Array, Array, Array]:
 
 
 def _normalised(
-    twin: Twin, key: str, shots: Shots, learned: np.ndarray, seed: int
+    twin: Twin, force: NeuralForce, seen: tuple[Array, Array, Array], seed: int
 ) -> dict[str, Any]:
     """Random weights with the scales of the data."""
-    found, plant = force_of(twin), plant_of(twin)
-    assert found is not None and isinstance(plant, AnalyticTwin)
-    rows = Shots(*(leaf[learned] for leaf in shots))
-    q, v, actuator = _seen(twin, rows)
-    inputs = jax.vmap(jax.vmap(found[1].inputs))(q, v, actuator)
+    plant, (q, v, actuator) = plant_of(twin), seen
+    assert isinstance(plant, AnalyticTwin)
+    inputs = jax.vmap(jax.vmap(force.inputs))(q, v, actuator)
     inputs = inputs.reshape(-1, inputs.shape[-1])
     scale = jnp.std(inputs, 0)
     masses = jax.vmap(jax.vmap(lambda q: jnp.diag(plant.mass_matrix(q, twin.params))))(q)
     pushed = masses[:, :-1] * jnp.diff(v, axis=1) / twin.dt
     inertial = jnp.median(jnp.abs(pushed), (0, 1)) * 1.4826
     size = jnp.where(inertial > 0.0, _OUTPUT * inertial, 1.0)
-    fresh = found[1].fresh(jax.random.key(seed))
-    return fresh | {
+    return force.fresh(jax.random.key(seed)) | {
         "input_mean": jnp.mean(inputs, 0),
         "input_scale": jnp.where(scale > 1e-6, scale, 1.0),
         "output_scale": size,
@@ -351,12 +334,3 @@ def _error(
     size = jnp.abs(error - basis @ (basis.T @ error))
     small = jnp.minimum(size, _OUTLIER)
     return jnp.mean(0.5 * small**2 + _OUTLIER * (size - small))
-
-
-def _mean_disagreement(twin: Twin, key: str, shots: Shots, learned: np.ndarray) -> float:
-    found = force_of(twin)
-    assert found is not None
-    own = _own(twin, key)
-    rows = Shots(*(leaf[learned] for leaf in shots))
-    disagree = lambda q, v, u: found[1].disagreement(q, v, u, own)  # noqa: E731
-    return float(jnp.mean(jax.vmap(jax.vmap(disagree))(*_seen(twin, rows))))

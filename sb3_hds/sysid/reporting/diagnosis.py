@@ -140,17 +140,13 @@ class Diagnosis:
             return OTHER_CONVENTION
         if self.verdict != "named":
             return SENTENCES[self.verdict]
-        new = [f for f in self.findings if self._is_new(f)]
+        added = {*self.twin.values} - {*self.believed.values}
+        new = [f for f in self.findings if {e.name for e in f.parameters.values()} <= added]
         said = {"lacks": new, "is wrong about": [f for f in self.findings if f not in new]}
         parts = [
             f"{verb} {' and '.join(map(choice, found))}" for verb, found in said.items() if found
         ]
         return f"The simulation {' and '.join(parts)}."
-
-    def _is_new(self, finding: Finding) -> bool:
-        """Whether the believed twin has nothing of the kind."""
-        names = {e.name for e in finding.parameters.values()}
-        return names <= {*self.twin.values} - {*self.believed.values}
 
     def summary(self) -> str:
         """:return: all of it in 80 columns"""
@@ -287,14 +283,11 @@ class Diagnosis:
             are not finite as None; ``params`` are the numbers of the extended twin, and arrays that
             were learned are left out
         """
-        found = {
-            field.name: getattr(self, field.name)
-            for field in dataclasses.fields(self)
-            if field.name not in ("believed", "twin", "pictures", "opened")
-        }
+        left_out = {"believed", "twin", "pictures", "opened"}
+        names = [f.name for f in dataclasses.fields(self) if f.name not in left_out]
+        found = {name: getattr(self, name) for name in names}
         twins = {"believed": self.believed.to_spec(), "twin": self.twin.to_spec()}
-        said = {"sentence": self.sentence, "params": self.twin.values}
-        return plain(found | twins | said)
+        return plain(found | twins | {"sentence": self.sentence, "params": self.twin.values})
 
     def to_html(
         self,

@@ -55,10 +55,12 @@ def several_in_words(findings: Sequence[Finding], joints: Sequence[str]) -> str:
     :param joints: names of all joints of the machine
     :return: a sentence: friction of the machine as a whole first, and what there is besides
     """
-    friction, rest = [], []
-    for f in findings:
-        (friction if f.effect in _FRICTION and f.where["slot"] == "joint" else rest).append(f)
-    besides = _listed([*_common(rest), *_offsets(rest), *map(_one, _others(rest))])
+    friction = [f for f in findings if f.effect in _FRICTION and f.where["slot"] == "joint"]
+    rest = [f for f in findings if f not in friction]
+    shared = [f for f in rest if f.where["name"] == EVERY]
+    offsets = [f for f in rest if f.effect == "constant_force"]
+    single = [f for f in rest if f not in shared and f not in offsets]
+    besides = _listed([*map(_of_all, shared), *_offsets(offsets), *map(_one, single)])
     head = _friction_of(friction, joints)
     told = f"{head}; {besides} besides." if head and rest else f"{head or besides}."
     return f"{told[:1].upper()}{told[1:]}"
@@ -71,9 +73,10 @@ def _friction_of(findings: Sequence[Finding], joints: Sequence[str]) -> str:
         own = {f.effect for f in findings if f.where["name"] == joint}
         if own:
             groups.setdefault(tuple(n for n in _FRICTION if n in own), []).append(joint)
-    if not groups:
+    where = [joint for own in groups.values() for joint in own]
+    if not where:
         return ""
-    where = [joint for joint in joints if any(joint in own for own in groups.values())]
+    where.sort(key=list(joints).index)
     subject = f"{_places(where, joints)} {_verb(where)}"
     if len(groups) == 1:
         (kinds,) = groups
@@ -85,27 +88,19 @@ def _friction_of(findings: Sequence[Finding], joints: Sequence[str]) -> str:
     return f"{subject} friction that the model lacks{carried}: {by_kind}"
 
 
-def _common(findings: Sequence[Finding]) -> list[str]:
+def _of_all(finding: Finding) -> str:
     """What all actuators share."""
-    said = []
-    for f in findings:
-        if f.where["name"] == EVERY:
-            how = _SHARED.get(f.effect, f"all actuators have {_article(_plain(f.effect))} of {{}}")
-            said.append(how.format(_size(f)))
-    return said
+    effect = finding.effect
+    how = _SHARED.get(effect, f"all actuators have {_article(_plain(effect))} of {{}}")
+    return how.format(_size(finding))
 
 
 def _offsets(findings: Sequence[Finding]) -> list[str]:
-    own = [f for f in findings if f.effect == "constant_force"]
-    if not own:
+    if not findings:
         return []
-    where, sizes = [f.where["name"] for f in own], [_size(f) for f in own]
-    what = "an offset" if len(own) == 1 else "offsets"
+    where, sizes = [f.where["name"] for f in findings], [_size(f) for f in findings]
+    what = "an offset" if len(findings) == 1 else "offsets"
     return [f"{_listed(where)} {_verb(where)} {what} of {_listed(sizes)}"]
-
-
-def _others(findings: Sequence[Finding]) -> list[Finding]:
-    return [f for f in findings if f.where["name"] != EVERY and f.effect != "constant_force"]
 
 
 def _one(finding: Finding) -> str:
@@ -171,9 +166,7 @@ def _carried(own: Sequence[Finding], verb: str) -> str:
 
 
 def _listed(items: Sequence[str]) -> str:
-    return (
-        items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
-    )
+    return " and ".join(filter(None, (", ".join(items[:-1]), *items[-1:])))
 
 
 def rows_of(findings: Sequence[Finding], joints: Sequence[str]) -> list[tuple[str, ...]]:
@@ -188,10 +181,10 @@ def rows_of(findings: Sequence[Finding], joints: Sequence[str]) -> list[tuple[st
         own = finding.where["slot"] == "parameter"
         place = "" if own else finding.where["name"]
         share = "" if finding.share is None else f"{finding.share:.0%}"
-        for e in finding.parameters.values():
-            rows.append(
-                (place, name, wording.size_in_words(e), wording.interval_in_words(e), share)
-            )
+        rows += [
+            (place, name, wording.size_in_words(e), wording.interval_in_words(e), share)
+            for e in finding.parameters.values()
+        ]
     return rows
 
 

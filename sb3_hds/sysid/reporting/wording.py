@@ -90,13 +90,11 @@ def policy_in_words(gain: Mapping[str, Any]) -> PolicyWords:
     found = {TRAINED_IN[name]: one for name, one in simulations.items()} | {PAIRED: gain["gain"]}
     starts = f"{episodes} start {'states' if episodes > 1 else 'state'}"
     over = f"over {runs} runs of {starts} each" if runs > 1 else f"over {starts}, one run"
-    columns, rows = (
-        ("trained in", "return"),
-        [(name, f"{r['mean']:.1f}") for name, r in found.items()],
-    )
+    columns = ("trained in", "return")
+    rows = [(name, f"{one['mean']:.1f}") for name, one in found.items()]
     if runs > 1:
-        columns = (*columns, "90 % interval over runs")
-        ends = (f"{r['low']:.1f} to {r['high']:.1f}" for r in found.values())
+        columns += ("90 % interval over runs",)
+        ends = [f"{one['low']:.1f} to {one['high']:.1f}" for one in found.values()]
         rows = [(*row, interval) for row, interval in zip(rows, ends, strict=True)]
     notes = [_paired_in_words(gain)]
     if runs == 1:
