@@ -16,7 +16,6 @@ number of rows for each independent one.
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,24 +39,10 @@ from sb3_hds.sysid.estimation.shooting import (
 _STEPS, _HUBER = 8, 3.0
 
 
-class _Fitted(NamedTuple):
-    """
-    :param cost: twice the negative logarithm of the likelihood, without the volume
-    :param z: parameters in units of their deviations, shape ``(k,)``
-    :param curvature: :math:`H`, shape ``(k, k)``
-    """
-
-    cost: Array
-    z: Array
-    curvature: Array
-
-
-def updated(answers: Answers, data: Trajectories, window: int | None = None) -> Answers:
+def updated(answers: Answers, data: Trajectories) -> Answers:
     """
     :param answers: that earlier data left open
     :param data: recorded since, sampled at the interval of the twins
-    :param window: steps of the windows; default: those of the answers, fewer where recordings are
-        shorter
     :return: the same answers, their weights and parameters as all data have them, likeliest first
     :raises CalibrationError: for other channels or another interval than the twin's
     :raises TrajectoryError: if no recording is long enough
@@ -70,17 +55,19 @@ def updated(answers: Answers, data: Trajectories, window: int | None = None) -> 
             f"{len(twin.actuators)} commands; the recordings have {data.n_obs} and {data.n_act}, "
             f"every {data.dt:g} s. Choose the columns, or resample: data.resample(dt={twin.dt:g})."
         )
-    length = min(window or answers.window, int(data.lengths.max()))
+    length = min(answers.window, int(data.lengths.max()))
     shots, _ = shots_of(data, length, twin)
     low, high = bounds_of(twin)
     with jax.enable_x64(True):
         fit = jax.jit(partial(_fitted, twin, shots, answers.noise, answers.correlated))
         fitted = [jax.tree.map(np.asarray, fit(*one)) for one in zip(values, factor, strict=True)]
     found = []
-    for answer, value, own, one in zip(answers.answers, values, factor, fitted, strict=True):
-        theta = np.clip(value + own @ one.z, low, high)
-        spread = np.linalg.cholesky(np.linalg.inv(one.curvature))
-        cost = float(one.cost) + float(np.linalg.slogdet(one.curvature)[1])
+    for answer, value, own, (cost, z, curvature) in zip(
+        answers.answers, values, factor, fitted, strict=True
+    ):
+        theta = np.clip(value + own @ z, low, high)
+        spread = np.linalg.cholesky(np.linalg.inv(curvature))
+        cost = float(cost) + float(np.linalg.slogdet(curvature)[1])
         cost = cost if np.isfinite(cost) else np.inf
         found.append(_answer(answer, twin, theta, own @ spread, answer.log_weight - 0.5 * cost))
     found.sort(key=lambda answer: -answer.log_weight)
@@ -98,7 +85,11 @@ def _answer(
 
 def _fitted(
     twin: Twin, shots: Shots, noise: np.ndarray, correlated: float, values: Array, factor: Array
-) -> _Fitted:
+) -> tuple[Array, Array, Array]:
+    """
+    :return: twice the negative logarithm of the likelihood, without the volume; parameters in units
+        of their deviations, shape ``(k,)``; and :math:`H`, shape ``(k, k)``
+    """
     names, n_z, n_x = tuple(twin.parameters), factor.shape[1], n_free(twin)
 
     def errors(shot: Shots, both: Array) -> Array:
@@ -138,4 +129,4 @@ def _fitted(
     start = jnp.zeros(n_z), jnp.zeros((shots.n, n_x))
     z, x = jax.lax.fori_loop(0, _STEPS, improve, start)
     cost, _, curvature, _ = normal(z, x)
-    return _Fitted(cost, z, curvature)
+    return cost, z, curvature

@@ -1,6 +1,7 @@
 """The recording that would decide, found by gradients through the twins."""
 
 import dataclasses
+import itertools
 import math
 import os
 from collections.abc import Mapping
@@ -157,9 +158,10 @@ def _with_loads(
     names = tuple(twin.parameters)
     extended = twin.extend(*new) if new else twin
     after = tuple(extended.parameters)
+    # The last place is that of zeros, for what is new.
     order = [names.index(name) if name in names else -1 for name in after]
-    values = np.array([[v[i] if i >= 0 else 0.0 for i in order] for v in values])
-    factor = np.array([[f[i] if i >= 0 else np.zeros(f.shape[1]) for i in order] for f in factor])
+    values = np.pad(values, ((0, 0), (0, 1)))[:, order]
+    factor = np.pad(factor, ((0, 0), (0, 1), (0, 0)))[:, order]
     loads = [f"{ConstantForce.name}.{joint.name}.tau_0" for joint in twin.joints]
     return extended, values, factor, tuple(after.index(n) if n in after else -1 for n in loads)
 
@@ -215,9 +217,7 @@ def _pairs(answers: Answers, ratios: np.ndarray, n: int) -> tuple[Pair, ...]:
     names = [answer.name for answer in answers.answers]
     found = [
         _pair(names[a], names[b], float(ratios[a, b]), n)
-        for a in range(len(names))
-        for b in range(len(names))
-        if a != b
+        for a, b in itertools.permutations(range(len(names)), 2)
     ]
     return tuple(sorted(found, key=lambda pair: pair.ratio))
 

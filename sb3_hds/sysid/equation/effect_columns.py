@@ -17,7 +17,7 @@ from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.effects import SensorDelay
 from sb3_hds.effects.joint import DryFriction
 from sb3_hds.sysid.equation.regression import STEP, Equation, Item, Rows, put, put_acting, ranges_of
-from sb3_hds.sysid.equation.terms import forces, portions, terms
+from sb3_hds.sysid.equation.terms import forces, memory_of, portions, terms
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.motion.joints import encoders
@@ -323,7 +323,7 @@ def add_sensor(
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
 def _observations(twin: Twin, q: Array, v: Array) -> Array:
-    memory = twin.infer(jnp.zeros(len(twin.channels), q.dtype), twin.params).memory
+    memory = memory_of(twin, twin.params, q.dtype)
     return jax.vmap(lambda q, v: twin.observe(State(q, v, memory), twin.params))(q, v)
 
 
@@ -351,7 +351,7 @@ def _inverted(
     twin: Twin, effect: SensorEffect, channels: tuple[int, ...], q: Array, v: Array, value: float
 ) -> tuple[Array, Array]:
     (name,) = effect.parameters
-    memory = twin.infer(jnp.zeros(len(twin.channels), q.dtype), twin.params).memory
+    memory = memory_of(twin, twin.params, q.dtype)
 
     def one(q: Array, v: Array) -> tuple[Array, Array]:
         obs = twin.observe(State(q, v, memory), twin.params)

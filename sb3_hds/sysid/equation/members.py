@@ -61,7 +61,7 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
     """
     found = p.solve(keys)
     covariance = _covariance(p, keys, found)
-    quantile = scipy.stats.t.ppf(0.5 + _CONFIDENCE / 2.0, max(p.grams.n_blocks - 1, 5))
+    quantile = scipy.stats.t.ppf(0.5 + _CONFIDENCE / 2.0, max(len(p.grams.blocks) - 1, 5))
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     stderr = dict(zip(found.free, errors, strict=True))
     base, held, out = p.score(keys, priced=False), p.held_out(keys), []

@@ -81,18 +81,9 @@ def plausibility(effect: str) -> Plausibility:
     return TABLE.get(name, _UNKNOWN._replace(family=name))
 
 
-def rarity(effect: str, command: str = "") -> float:
-    """
-    :param effect: name in the catalogue
-    :param command: unit of the command of the actuator at which it is; empty elsewhere
-    :return: minus the logarithm of the prior odds
-    """
-    own = plausibility(effect).rarity
-    set_point = effect in _OF_AMPLIFIERS and command in SET_POINTS
-    return own + _SET_POINT if set_point else own
-
-
 def rarity_of(candidate: Candidate, twin: Twin) -> float:
-    """:return: :func:`rarity` of a candidate at its place in a twin"""
-    command = twin.actuators[candidate.index].unit if candidate.slot == "actuator" else ""
-    return rarity(candidate.name, command)
+    """:return: minus the logarithm of the prior odds of a candidate at its place in a twin"""
+    own = plausibility(candidate.name).rarity
+    if candidate.slot != "actuator" or candidate.name not in _OF_AMPLIFIERS:
+        return own
+    return own + _SET_POINT if twin.actuators[candidate.index].unit in SET_POINTS else own

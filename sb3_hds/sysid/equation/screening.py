@@ -210,13 +210,13 @@ def screen(
     if not made.items:
         return None
     p = problem(hypotheses, made)
-    found = propose(p)
-    set_of = _members_of(hypotheses, p, [i for i in found.keys if i not in p.always])
-    hints = tuple(p.items[i].key for i in found.hints)
+    chosen, hinted = propose(p)
+    set_of = _members_of(hypotheses, p, [i for i in chosen if i not in p.always])
+    hints = tuple(p.items[i].key for i in hinted)
     small = len(coarse.joints) <= SMALL_MACHINE
     where = [joint.name for joint in coarse.joints]
     if not small:
-        left = predictable(p, found.keys) > _LEFT
+        left = predictable(p, chosen) > _LEFT
         where = [n for n, much in zip(where, left, strict=True) if much and len(set_of) < 2]
     keys = {m.key for m in set_of}
     keys |= {p.items[o].key for m in set_of for o in simpler(p, m.item)}

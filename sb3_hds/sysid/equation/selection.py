@@ -1,7 +1,6 @@
 """Which causes, all at once: a search over families, judged on data that were held out."""
 
 from collections.abc import Collection
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,18 +26,11 @@ LATE = ("action_delay", "motor_lag")
 _MANY_JOINTS = 3
 
 
-class Proposal(NamedTuple):
+def propose(problem: Problem) -> tuple[list[int], list[int]]:
     """
-    :param keys: items of the set
-    :param hints: items that are small beside what stays unexplained
+    :return: items of the set of causes that explains most for its price, each of which held-out
+        data confirm; and hints: items that are small beside the unexplained residual
     """
-
-    keys: tuple[int, ...]
-    hints: tuple[int, ...]
-
-
-def propose(problem: Problem) -> Proposal:
-    """:return: the set of causes that explains most for its price, each of which data confirm"""
     _, keys = min((_climb(problem, start) for start in _starts(problem)), key=lambda r: r[0])
     keys = _shared_instead(problem, keys)
     keys = _shaken(problem, keys)
@@ -46,8 +38,7 @@ def propose(problem: Problem) -> Proposal:
     keys = simplified(problem, keys)
     keys = plausible_first(problem, keys)
     keys = simplified(problem, confirmed(problem, keys))
-    kept, hints = outstanding(problem, keys)
-    return Proposal(tuple(kept), tuple(hints))
+    return outstanding(problem, keys)
 
 
 # ------------------------------------------------------------------------------ starts

@@ -172,7 +172,7 @@ def _one_step(
 def _side_by_side(
     twin: Twin, params: Params, push: Array, q: Array, v: Array, actions: Array
 ) -> tuple:
-    nothing = _memory_of(twin, params, q.dtype)
+    nothing = memory_of(twin, params, q.dtype)
     one = lambda q, v, u: _one_step(twin, params, push, State(q, v, nothing), u)[1]  # noqa: E731
     return jax.vmap(one)(q, v, actions)
 
@@ -181,7 +181,7 @@ def _side_by_side(
 def _one_after_the_other(
     twin: Twin, params: Params, push: Array, q: Array, v: Array, actions: Array
 ) -> tuple:
-    obs = twin.observe(State(q[0], v[0], _memory_of(twin, params, q.dtype)), params)
+    obs = twin.observe(State(q[0], v[0], memory_of(twin, params, q.dtype)), params)
     first = twin.infer(obs, params).memory
 
     def advance(memory: dict, row: tuple) -> tuple[dict, tuple]:
@@ -191,7 +191,8 @@ def _one_after_the_other(
     return jax.lax.scan(advance, first, (q, v, actions))[1]
 
 
-def _memory_of(twin: Twin, params: Params, dtype: np.dtype) -> dict:
+def memory_of(twin: Twin, params: Params, dtype: np.dtype) -> dict:
+    """:return: what a twin remembers before a recording begins"""
     obs = jnp.zeros(len(twin.channels), dtype)
     return twin.infer(obs, params).memory
 

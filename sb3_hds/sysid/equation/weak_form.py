@@ -227,7 +227,6 @@ class Grams(NamedTuple):
     :param floor: what the noise of velocities alone would leave of each joint's rows, in their unit
     :param scale: noise of a row of each joint [N m] or [N]
     :param gain: by which a constant force is larger in a row of each joint than at an instant
-    :param n_blocks: number of blocks
     """
 
     blocks: np.ndarray
@@ -237,7 +236,6 @@ class Grams(NamedTuple):
     floor: Float[np.ndarray, " dof"]
     scale: Float[np.ndarray, " dof"]
     gain: Float[np.ndarray, " dof"]
-    n_blocks: int
 
 
 def grams(equation: Equation) -> Grams:
@@ -274,7 +272,7 @@ def grams(equation: Equation) -> Grams:
             blocks[b][index] += local[b]
             folds[fold_of[b], j][index] += local[b]
         by_joint[j][index] = local.sum(0)
-    return Grams(blocks, by_joint, folds, effective, floor, scale, gain, n_blocks)
+    return Grams(blocks, by_joint, folds, effective, floor, scale, gain)
 
 
 def _deflation(local: np.ndarray, rich: np.ndarray, most: float) -> float:

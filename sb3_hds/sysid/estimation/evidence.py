@@ -229,10 +229,6 @@ class Evidence:
             return first_offsets(h.twin, np.asarray(self.shots.obs, float), h.twin.dt, params)
 
     @cached_property
-    def _counted(self) -> np.ndarray:
-        return np.ones(self.shots.obs.shape[1]) if self.rows is None else self.rows
-
-    @cached_property
     def _most_known(self) -> int:
         """Of all windows, the most steps that were recorded before one."""
         return int(np.asarray(self.shots.lead_known).sum(1).max(initial=0.0))
@@ -300,7 +296,8 @@ class Evidence:
             raw, by_start, by_theta = found
             slopes.append(by_theta)
         by_theta = np.concatenate(slopes, -1)[..., : len(index)]
-        return normal_equations(raw, by_start, by_theta, self.noise, self._counted, self.threshold)
+        counted = np.ones(raw.shape[1]) if self.rows is None else self.rows
+        return normal_equations(raw, by_start, by_theta, self.noise, counted, self.threshold)
 
 
 def in_threads(work: Callable[[_Given], _Told], given: Sequence[_Given]) -> Iterator[_Told]:

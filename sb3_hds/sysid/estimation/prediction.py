@@ -87,18 +87,15 @@ def gain(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"]) -> float:
     return float(1.0 - np.sqrt(np.divide(*squares)))
 
 
-def is_better(
-    new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], least: float = _LEAST_GAIN
-) -> bool:
+def is_better(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"]) -> bool:
     """
     Whether the errors of held-out windows are significantly lower: also in 95 % of bootstrap
     samples of the windows.
 
     :param new: errors of each window
     :param old: errors of the same windows
-    :param least: the gain that counts
     """
-    if len(new) < 2 or not gain(new, old) >= least:
+    if len(new) < 2 or not gain(new, old) >= _LEAST_GAIN:
         return False
     lower = np.clip(old, 1e-9, 1e9) ** 2 - np.clip(new, 1e-9, 1e9) ** 2
     drawn = np.random.default_rng(0).integers(len(lower), size=(_N_BOOTSTRAP, len(lower)))

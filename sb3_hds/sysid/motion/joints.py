@@ -68,14 +68,13 @@ def encoders(twin: Twin) -> dict[int, Encoder]:
 
 
 def motion_of(
-    twin: Twin, obs: Float[np.ndarray, "n rows obs"], dt: float, params: Params | None = None
+    twin: Twin, obs: Float[np.ndarray, "n rows obs"], dt: float
 ) -> tuple[Float[np.ndarray, "n rows dof"], Float[np.ndarray, "n rows dof"]]:
     """
     :param obs: measurements in a row, every ``dt`` [s]
-    :param params: under which they are read; default: the twin's own
     :return: positions, and velocities; where no velocity is observed, differences of positions
     """
-    q, v, ways = _read(twin, obs, twin.params if params is None else params)
+    q, v, ways = _read(twin, obs, twin.params)
     if q.shape[1] > 1 and not v.any():
         v = _rates(ways, dt)
     return q, v
@@ -94,13 +93,6 @@ def first_offsets(
     q, v, ways = _read(twin, obs[:, :_FEW], twin.params if params is None else params)
     v = np.zeros_like(q) if v[:, 0].any() else _rates(ways, dt)
     return np.concatenate([np.zeros_like(q[:, 0]), v.mean(1)], 1)
-
-
-def _rates(ways: Float[np.ndarray, "n ways dof"], dt: float) -> Float[np.ndarray, "n rows dof"]:
-    """Differences over two steps, over one at the ends."""
-    rates = ways / dt
-    inside = 0.5 * (rates[:, 1:] + rates[:, :-1])
-    return np.concatenate([rates[:, :1], inside, rates[:, -1:]], 1)
 
 
 def _read(twin: Twin, obs: np.ndarray, params: Params) -> tuple[np.ndarray, ...]:
@@ -164,10 +156,16 @@ def differences(
     """
     :param shift: when a velocity is true, between half an interval before its position and half an
         interval after it
-    :return: from differences to the rows before and after
+    :return: velocities from differences to the rows before and after
     """
-    change = np.diff(q, axis=0) / dt
-    before, after = np.concatenate([change[:1], change]), np.concatenate([change, change[-1:]])
+    return _rates(np.diff(q, axis=0), dt, shift)
+
+
+def _rates(ways: np.ndarray, dt: float, shift: float = 0.0) -> np.ndarray:
+    """Velocities at all rows, from the ways between them, shape ``(..., rows - 1, dof)``."""
+    rates = ways / dt
+    before = np.concatenate([rates[..., :1, :], rates], -2)
+    after = np.concatenate([rates, rates[..., -1:, :]], -2)
     return (0.5 - shift) * before + (0.5 + shift) * after
 
 

@@ -166,11 +166,8 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
     )
 
 
-class _Expected(NamedTuple):
-    """What the model alone predicts of one recording, each leaf of shape ``(rows, dof)``."""
-
-    q: np.ndarray
-    v: np.ndarray
+#: positions and velocities that the model alone predicts of one recording, each ``(rows, dof)``
+_Expected = tuple[np.ndarray, np.ndarray]
 
 
 def _by_the_model(twin: Twin, data: Trajectories) -> list[_Expected | None]:
@@ -194,8 +191,8 @@ def _by_the_model(twin: Twin, data: Trajectories) -> list[_Expected | None]:
         given = jnp.asarray(starts, jnp.float64), jnp.asarray(commands, jnp.float64)
         q, v = map(np.asarray, _simulated(twin, params, *given))
     rows = [int(length) + 1 for length in data.lengths]
-    found = [_Expected(q[i, :m], v[i, :m]) for i, m in enumerate(rows)]
-    return [one if np.isfinite(one.q).all() and np.isfinite(one.v).all() else None for one in found]
+    found = [(q[i, :m], v[i, :m]) for i, m in enumerate(rows)]
+    return [pair if all(np.isfinite(x).all() for x in pair) else None for pair in found]
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
@@ -220,7 +217,7 @@ def _smoothed(
     for j in range(q.shape[1]):
         own = smooth(q[:, j], v[:, j] if measured[j] else None, dt, shift)
         if expected is not None:
-            beside = expected.q[:, j], expected.v[:, j]
+            beside = expected[0][:, j], expected[1][:, j]
             left = q[:, j] - beside[0], v[:, j] - beside[1] if measured[j] else None
             rest = smooth(*left, dt, shift)
             if rest.noise_q < own.noise_q and rest.noise_v <= own.noise_v:
@@ -236,7 +233,7 @@ def _smoothed(
 def _differences(q: np.ndarray, dt: float, shift: float, expected: _Expected | None) -> np.ndarray:
     if expected is None:
         return differences(q, dt, shift)
-    return expected.v + differences(q - expected.q, dt, shift)
+    return expected[1] + differences(q - expected[0], dt, shift)
 
 
 def _thinned(

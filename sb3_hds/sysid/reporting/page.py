@@ -17,6 +17,7 @@ from sb3_hds.sysid.design.result import NextExperiment
 from sb3_hds.sysid.reporting import figures as plots
 from sb3_hds.sysid.reporting import wording
 from sb3_hds.sysid.reporting.diagnosis import Diagnosis
+from sb3_hds.sysid.reporting.finding import Finding
 from sb3_hds.sysid.reporting.moving import moving_of
 from sb3_hds.sysid.reporting.printed import COLUMNS, alike_in_words, rows_of
 
@@ -110,34 +111,17 @@ def write_pictures(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list
 
 
 def _content(d: Diagnosis) -> dict[str, Any]:
-    findings = [
-        {
-            "effect": f.effect,
-            "slot": f.where["slot"],
-            "place": "" if f.where["slot"] == "parameter" else f.where["name"],
-            "explanation": f.explanation,
-            "rows": [
-                (n, wording.size_in_words(e), f"{e.stderr:.2g}", wording.interval_in_words(e))
-                for n, e in f.parameters.items()
-            ],
-            "evidence": wording.evidence_in_words(f.gain, f.p_value),
-            "alternatives": ", ".join(f.alternatives),
-        }
-        for f in d.findings
-    ]
     n = 0 if d.pictures is None else len(np.unique(d.pictures.missing.origin))
     return {
         "d": d,
         "moving": d.pictures and moving_of(d.believed, d.twin, d.pictures.replay).section(),
         "wording": wording,
-        "title": f"{d.twin.name}: {d.verdict}",
         "n_recordings": f"{n} recordings" if n > 1 else "its recording",
         "colour": _COLOURS.get(d.verdict, _NO_NAME),
-        "findings": findings,
+        "sizes_of": _sizes_of,
         "COLUMNS": COLUMNS,
         "causes": rows_of(d.findings, [joint.name for joint in d.believed.joints]),
         "alike": alike_in_words(d.findings),
-        "explained": wording.explained_in_words(d.explained),
         "rejected": [
             (r.name, wording.share_in_words(r.gain), wording.p_value_in_words(r.p_value), r.why)
             for r in d.rejected
@@ -148,6 +132,14 @@ def _content(d: Diagnosis) -> dict[str, Any]:
             for key, sizes in d.detectable.items()
         ],
     }
+
+
+def _sizes_of(finding: Finding) -> list[tuple[str, ...]]:
+    """Name, estimate, standard error and interval of each parameter."""
+    return [
+        (name, wording.size_in_words(e), f"{e.stderr:.2g}", wording.interval_in_words(e))
+        for name, e in finding.parameters.items()
+    ]
 
 
 def _parameters(d: Diagnosis) -> list[tuple[str, str, str]]:
