@@ -15,7 +15,7 @@ from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ConstantForce, CoulombFriction, ViscousFriction
 from sb3_hds.sysid.equation.assembly import equation, problem
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
-from sb3_hds.sysid.motion.motion import Motion, Moved
+from sb3_hds.sysid.motion.motion import JointMotion, Motion
 
 # What nearly every machine has, whatever is wrong with its log.
 _ALWAYS = (ViscousFriction, CoulombFriction, ConstantForce)
@@ -189,7 +189,9 @@ def _swap(n: int, i: int, j: int) -> Callable[[np.ndarray], np.ndarray]:
 
 def _changed(motion: Motion, change: _Change) -> Motion:
     recordings = tuple(
-        Moved(change.q(r.q), *map(change.slopes, (r.v, r.a, r.raw)), change.actions(r.actions))
+        JointMotion(
+            change.q(r.q), *map(change.slopes, (r.v, r.a, r.raw)), change.actions(r.actions)
+        )
         for r in motion.recordings
     )
     places = np.arange(len(motion.noise_q))
@@ -214,5 +216,5 @@ def _fewer(motion: Motion, most: int = _ROWS) -> Motion:
     for r in motion.recordings:
         rows = max(int(len(r.actions) * most / n), min(len(r.actions), 50))
         q, v, a, raw = (x[: rows + 1] for x in r[:4])
-        kept.append(Moved(q, v, a, raw, r.actions[:rows]))
+        kept.append(JointMotion(q, v, a, raw, r.actions[:rows]))
     return motion._replace(recordings=tuple(kept))

@@ -32,7 +32,7 @@ _STEPS, _RECORDINGS = 1000, 4
 _HALF, _ABOUT = -0.5, 0.1
 
 
-def in_step(twin: Twin, data: Trajectories) -> tuple[Trajectories, tuple[str, ...]]:
+def align_velocities(twin: Twin, data: Trajectories) -> tuple[Trajectories, tuple[str, ...]]:
     """
     Velocities moved to where those of the twin are, relative to its positions.
 
@@ -96,7 +96,7 @@ def _replayed(twin: Twin, data: Trajectories) -> Trajectories:
     return Trajectories.from_arrays(list(simulated), list(actions), dt=data.dt)
 
 
-def in_step_with_the_log(
+def match_logged_integrator(
     twin: Twin, data: Trajectories
 ) -> tuple[Twin, Trajectories, tuple[str, ...]]:
     """

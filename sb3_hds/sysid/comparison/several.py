@@ -82,7 +82,7 @@ def confirmed_set(
         screened = screened.among(members)
         members = _members(search, screened)
     p, every = screened.problem, [m.item for m in screened.members]
-    carried = dict(zip(every, map(float, p.carried(every)), strict=True))
+    carried = dict(zip(every, map(float, p.force_shares(every)), strict=True))
     found = [
         _accepted(search, candidate, member, members, verdicts[key], base, lost.get(key))._replace(
             share=carried[member.item],

@@ -54,7 +54,7 @@ _LEAST, _BESIDE = 1.0, 0.1
 _PRICE, _NEAR = 200.0, 0.85
 
 
-class Question(NamedTuple):
+class DesignProblem(NamedTuple):
     """
     The numbers of a design problem; those that no program depends on.
 
@@ -75,7 +75,7 @@ class Question(NamedTuple):
     correlated: float
 
 
-class Told(NamedTuple):
+class Evaluation(NamedTuple):
     r"""
     What commands for ``n`` recordings are worth, and what they ask of the machine.
 
@@ -117,9 +117,9 @@ class Excitation:
         self.cycles = np.concatenate([[0.0], cycles, cycles])
         self.sensors = {effect_key(e) for e in effects_of(twin) if isinstance(e, SensorEffect)}
         self._names = tuple(twin.parameters)
-        #: (commands, question) -> :class:`Told`
-        self.told = jax.jit(self._told)
-        #: (coefficients of each start, question) -> objective, largest usage of a limit, gradient
+        #: (commands, problem) -> :class:`Evaluation`
+        self.evaluate = jax.jit(self._evaluate)
+        #: (coefficients of each start, problem) -> objective, largest usage of a limit, gradient
         self.ascent = jax.jit(self._ascent)
 
     def commands(
@@ -131,12 +131,12 @@ class Excitation:
         return 0.5 * (low + high) + 0.5 * (high - low) * jnp.tanh(waves)
 
     def _ascent(
-        self, coefficients: Float[Array, "starts n waves act"], asked: Question
+        self, coefficients: Float[Array, "starts n waves act"], problem: DesignProblem
     ) -> tuple[Array, Array, Array]:
 
         def cost(one: Array) -> tuple[Array, tuple[Array, Array]]:
-            told = self._told(self.commands(one), asked)
-            m, usage = len(asked.values), told.usage
+            told = self._evaluate(self.commands(one), problem)
+            m, usage = len(problem.values), told.usage
             if m == 1:
                 worth = told.gains[0]
             else:
@@ -153,18 +153,18 @@ class Excitation:
             slopes, told = jax.vmap(jax.jacfwd(cost, has_aux=True))(coefficients)
         return told[0], told[1], slopes
 
-    def _told(self, actions: Float[Array, "n steps act"], asked: Question) -> Told:
-        states, outputs, usage = self._rollouts(actions, asked)
-        m = len(asked.values)
+    def _evaluate(self, actions: Float[Array, "n steps act"], problem: DesignProblem) -> Evaluation:
+        states, outputs, usage = self._rollouts(actions, problem)
+        m = len(problem.values)
 
         def of(pair: Array) -> tuple[Array, Array, Array]:
             """What answer ``b`` leaves of what ``a`` predicts, and what it says of ``b``."""
             a, b = pair
             mine, theirs = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in (a, b))
-            own = (jnp.asarray(asked.values[b]), jnp.asarray(asked.factor[b]))
-            normal = partial(self._normal, *own, jnp.asarray(asked.weight))
+            own = (jnp.asarray(problem.values[b]), jnp.asarray(problem.factor[b]))
+            normal = partial(self._normal, *own, jnp.asarray(problem.weight))
             found = jax.vmap(normal)(mine, theirs, outputs[a], actions)
-            rest, score, curvature = (jnp.sum(x, 0) / asked.correlated for x in found)
+            rest, score, curvature = (jnp.sum(x, 0) / problem.correlated for x in found)
             bread = curvature + jnp.eye(len(curvature), dtype=curvature.dtype)
             moved = jnp.linalg.solve(bread, score)
             return rest - score @ moved, 0.5 * jnp.linalg.slogdet(bread)[1], curvature
@@ -172,15 +172,15 @@ class Excitation:
         pairs = np.stack(np.meshgrid(range(m), range(m), indexing="ij"), -1).reshape(-1, 2)
         ratios, gains, curvature = jax.vmap(of)(jnp.asarray(pairs))
         own = jnp.diag(gains.reshape(m, m))
-        return Told(ratios.reshape(m, m), own, curvature[0], outputs[:m], usage)
+        return Evaluation(ratios.reshape(m, m), own, curvature[0], outputs[:m], usage)
 
-    def _rollouts(self, actions: Array, asked: Question) -> tuple[State, Array, Array]:
+    def _rollouts(self, actions: Array, problem: DesignProblem) -> tuple[State, Array, Array]:
         """Of the answers, then of the corners; only the answers' states are returned."""
-        vectors = jnp.concatenate([asked.values, asked.corners])
+        vectors = jnp.concatenate([problem.values, problem.corners])
 
         def one(vector: Array, commands: Array) -> tuple[State, Array, Array]:
             params = self._params(vector)
-            begin = self.twin.infer(jnp.asarray(asked.start), params)
+            begin = self.twin.infer(jnp.asarray(problem.start), params)
             begin = jax.tree.map(lambda leaf: jnp.asarray(leaf, vector.dtype), begin)
             run = rollout(self.twin, params, begin, commands)
             force = self._forces(run.states, commands, params)
@@ -191,7 +191,7 @@ class Excitation:
             return run.states, outputs, self._usage(run.states, most)
 
         states, outputs, usage = jax.vmap(lambda v: jax.vmap(lambda a: one(v, a))(actions))(vectors)
-        states = jax.tree.map(lambda leaf: leaf[: len(asked.values)], states)
+        states = jax.tree.map(lambda leaf: leaf[: len(problem.values)], states)
         return states, outputs, jnp.max(usage, (0, 1))
 
     def _forces(

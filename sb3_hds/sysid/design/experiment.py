@@ -27,7 +27,7 @@ from sb3_hds.sysid.belief.answers import (
     everything_open,
     union,
 )
-from sb3_hds.sysid.design.excitation import Excitation, Question
+from sb3_hds.sysid.design.excitation import DesignProblem, Excitation
 from sb3_hds.sysid.design.limits import BY_JOINT, Limits
 from sb3_hds.sysid.design.result import SURE, NextExperiment, Pair
 from sb3_hds.sysid.reporting.wording import with_unit
@@ -39,7 +39,7 @@ _MOST = 0.9
 # Parameters of each answer for which limits hold besides: this many standard deviations either way
 # along the widest directions of its covariance.
 _DEVIATIONS, _DIRECTIONS = 2.0, 2
-# Odds at which a question is decided.
+# Odds at which answers count as decided.
 _ODDS = 19.0
 # Recordings beyond which an experiment is no way to decide, and of those that another sensor or a
 # load may take.
@@ -71,19 +71,19 @@ def next_experiment(
     if not (others or first.factor):
         # Nothing is wrong and nothing uncertain: what would show if it were there?
         answers = dataclasses.replace(answers, answers=(everything_open(first.twin),))
-    twin, asked, loads = question(answers, start)
+    twin, problem, loads = design_problem(answers, start)
     bounds = Limits.of(limits).at(twin)
     n_steps = _steps(seconds, twin, n, seed)
     with jax.enable_x64(True):
         excitation = Excitation(twin, bounds, n_steps, answers.window)
-        found = _found(excitation, asked, n, seed, progress)
+        found = _found(excitation, problem, n, seed, progress)
         actions = np.asarray(excitation.commands(jnp.asarray(found)))
-        told = jax.tree.map(np.asarray, excitation.told(actions, asked))
+        told = jax.tree.map(np.asarray, excitation.evaluate(actions, problem))
         pairs = _pairs(answers, told.ratios, n)
         decides = not pairs or bool(pairs[0].needed <= _MOST_RECORDINGS)
         would_tell = ()
         if not decides:
-            would_tell = _would_tell(excitation, actions, asked, told.outputs, loads)
+            would_tell = _would_tell(excitation, actions, problem, told.outputs, loads)
     alone = len(answers.answers) == 1
     outputs = told.outputs[..., : len(twin.channels)]
     return NextExperiment(
@@ -96,26 +96,28 @@ def next_experiment(
         actuators=tuple((a.name, a.unit) for a in twin.actuators),
         pairs=pairs,
         information=float(told.gains[0]),
-        narrower=_narrower(twin, asked, told.curvature) if alone else {},
+        narrower=_narrower(twin, problem, told.curvature) if alone else {},
         usage=_usage(told.usage, twin),
         decides=decides,
         would_tell=would_tell,
     )
 
 
-def question(answers: Answers, start: Any = None) -> tuple[Twin, Question, tuple[int, ...]]:
+def design_problem(
+    answers: Answers, start: Any = None
+) -> tuple[Twin, DesignProblem, tuple[int, ...]]:
     """
     :param answers: that the data leave open
     :param start: observation at the start; default: that of the answers
-    :return: the twin with everything that any answer has, and a known load at each joint; what is
-        asked about it; and for each joint the index of its load's parameter, -1 without one
+    :return: the twin with everything that any answer has, and a known load at each joint; its
+        numbers; and for each joint the index of its load's parameter, -1 without one
     :raises CalibrationError: for an impossible start
     """
     twin, values, factor = union(answers.answers)
     twin, values, factor, loads = _with_loads(twin, values, factor)
     weight = np.concatenate([1.0 / answers.noise, np.zeros(len(twin.joints))])
     begin, corners = _start(start, answers, twin), _corners(twin, values, factor)
-    return twin, Question(values, factor, corners, begin, weight, answers.correlated), loads
+    return twin, DesignProblem(values, factor, corners, begin, weight, answers.correlated), loads
 
 
 def _steps(seconds: float, twin: Twin, n: int, seed: int) -> int:
@@ -180,7 +182,7 @@ def _corners(twin: Twin, values: np.ndarray, factor: np.ndarray) -> np.ndarray:
 
 
 def _found(
-    excitation: Excitation, asked: Question, n: int, seed: int, progress: bool
+    excitation: Excitation, problem: DesignProblem, n: int, seed: int, progress: bool
 ) -> Float[np.ndarray, "n waves act"]:
     """:return: the best coefficients that were met on the way of any start, within all limits"""
     rng, n_act = np.random.default_rng(seed), len(excitation.twin.actuators)
@@ -193,7 +195,7 @@ def _found(
     state, best, worth = optimizer.init(now), None, -np.inf
     steps = track(range(_STEPS), "designing", transient=True, disable=not progress)
     for _ in steps:
-        told, usage, slopes = map(np.asarray, excitation.ascent(now, asked))
+        told, usage, slopes = map(np.asarray, excitation.ascent(now, problem))
         inside = np.where(np.isfinite(told) & (usage <= _MOST), told, -np.inf)
         if inside.max() > worth:
             worth, best = float(inside.max()), np.array(now[int(inside.argmax())])
@@ -202,7 +204,7 @@ def _found(
         step, state = optimizer.update(slopes / np.maximum(norm, 1.0), state, now)
         now = np.asarray(optax.apply_updates(now, step))
     if best is None:
-        told = excitation.told(excitation.commands(now[0]), asked)
+        told = excitation.evaluate(excitation.commands(now[0]), problem)
         usage = _usage(np.asarray(told.usage), excitation.twin)
         worst = max(usage, key=usage.__getitem__)
         raise CalibrationError(
@@ -235,17 +237,17 @@ def _pair(true: str, other: str, strength: float, n: int) -> Pair:
 
 
 def _would_tell(
-    excitation: Excitation, actions: Any, asked: Question, outputs: np.ndarray, loads: Any
+    excitation: Excitation, actions: Any, problem: DesignProblem, outputs: np.ndarray, loads: Any
 ) -> tuple[str, ...]:
     """What makes the pair that is hardest to tell apart easy, with the same commands."""
-    twin, m = excitation.twin, len(asked.values)
+    twin, m = excitation.twin, len(problem.values)
     n_obs = len(twin.channels)
     largest = np.abs(outputs[..., n_obs:]).max((0, 1, 2))
     enough = _pair("", "", 1.0, 1).needed
 
-    def in_words(changed: Question) -> str:
+    def in_words(changed: DesignProblem) -> str:
         """Nothing where a few such recordings would not tell."""
-        ratios = np.asarray(excitation.told(actions, changed).ratios)
+        ratios = np.asarray(excitation.evaluate(actions, changed).ratios)
         needed = enough / max(float(ratios[~np.eye(m, dtype=bool)].min()), 1e-12)
         if needed > _FEW:
             return ""
@@ -256,24 +258,24 @@ def _would_tell(
         unit = "N" if joint.unit == "m" else "N m"
         if not largest[j] > 0.0:
             continue
-        weight = asked.weight.copy()
+        weight = problem.weight.copy()
         weight[n_obs + j] = 1.0 / (_SENSOR * largest[j])
-        if verb := in_words(asked._replace(weight=weight)):
+        if verb := in_words(problem._replace(weight=weight)):
             error = with_unit(f"{_SENSOR * largest[j]:.2g}", unit)
             told.append(
                 f"A sensor of the actuator's force at {joint.name}, good to {error}, {verb}"
             )
         if loads[j] < 0:
             continue
-        values = asked.values.copy()
+        values = problem.values.copy()
         values[:, loads[j]] += _LOAD * largest[j]
-        if verb := in_words(asked._replace(values=values)):
+        if verb := in_words(problem._replace(values=values)):
             force = with_unit(f"{_LOAD * largest[j]:.2g}", unit)
             told.append(
                 f"A known load at {joint.name}, a constant force of {force} as of a weight on a "
                 f"string, {verb}"
             )
-    if verb := in_words(asked._replace(weight=_FINER * asked.weight)):
+    if verb := in_words(problem._replace(weight=_FINER * problem.weight)):
         told.append(f"Errors {_FINER:.0f} times smaller, of sensors and of the model, {verb}")
     if not told:
         told.append(
@@ -283,9 +285,11 @@ def _would_tell(
     return tuple(told)
 
 
-def _narrower(twin: Twin, asked: Question, curvature: np.ndarray) -> dict[str, tuple[float, float]]:
+def _narrower(
+    twin: Twin, problem: DesignProblem, curvature: np.ndarray
+) -> dict[str, tuple[float, float]]:
     """Standard deviations of the only answer's parameters, before and after."""
-    factor = asked.factor[0]
+    factor = problem.factor[0]
     after = factor @ np.linalg.inv(curvature + np.eye(len(curvature))) @ factor.T
     now, then = (np.sqrt(np.maximum(np.diag(c), 0.0)) for c in (factor @ factor.T, after))
     names = tuple(twin.parameters)

@@ -36,33 +36,36 @@ _NO_MATTER = 0.02
 _SOME = 0.02
 
 
-def material(p: Problem, keys: list[int]) -> list[int]:
+def drop_negligible(p: Problem, keys: list[int]) -> list[int]:
     """Remove members with a negligible force, unless they explain most of what the others leave."""
     held = p.held_out(keys)
     kept: set[int] = set()
     while keys:
         own = [i in p.always or i in kept for i in keys]
-        share = np.where(own, 1.0, p.carried(keys))
+        share = np.where(own, 1.0, p.force_shares(keys))
         worst = int(np.argmin(share))
         if share[worst] > _MATERIAL:
             break
         rest = [i for i in keys if i != keys[worst]]
         without = p.held_out(rest)
-        if share[worst] > _TRACE and worth(p, without, held, keys[worst])[0] > _MOST_OF_THE_REST:
+        if (
+            share[worst] > _TRACE
+            and held_out_gain(p, without, held, keys[worst])[0] > _MOST_OF_THE_REST
+        ):
             kept.add(keys[worst])
         else:
             keys, held = rest, without
     return keys
 
 
-def confirmed(p: Problem, keys: list[int]) -> list[int]:
+def drop_unconfirmed(p: Problem, keys: list[int]) -> list[int]:
     """Remove members, the least significant first, until all lower held-out errors."""
     while keys:
         held = p.held_out(keys)
         t = [
             np.inf
             if i in p.always
-            else worth(p, p.held_out([m for m in keys if m != i]), held, i)[1]
+            else held_out_gain(p, p.held_out([m for m in keys if m != i]), held, i)[1]
             for i in keys
         ]
         # The rarer a cause is, the surer it has to be.
@@ -70,31 +73,31 @@ def confirmed(p: Problem, keys: list[int]) -> list[int]:
         if min(short) > 0.0:
             break
         rest = [i for i, x in zip(keys, short, strict=True) if x > min(short)]
-        keys = admitted(p, retuned(p, rest))
+        keys = enforce_bounds(p, retune(p, rest))
     return keys
 
 
-def retuned(p: Problem, keys: list[int]) -> list[int]:
+def retune(p: Problem, keys: list[int]) -> list[int]:
     """Choose the nonlinear parameters of each member anew, given the other members."""
     for place, i in enumerate(list(keys)):
         if p.items[i].settings and i not in p.always:
             same = [o for o, item in enumerate(p.items) if item.key == p.items[i].key]
             trials = [[*keys[:place], o, *keys[place + 1 :]] for o in same]
-            keys = min(trials, key=lambda t: (t[place] in p.beyond(t), p.solve(t).rss))
+            keys = min(trials, key=lambda t: (t[place] in p.out_of_bounds(t), p.solve(t).rss))
     return keys
 
 
-def admitted(p: Problem, keys: list[int]) -> list[int]:
+def enforce_bounds(p: Problem, keys: list[int]) -> list[int]:
     """Replace members that left their bounds by simpler ones of their family, or remove them."""
-    while beyond := [i for i in p.beyond(keys) if i not in p.always]:
+    while beyond := [i for i in p.out_of_bounds(keys) if i not in p.always]:
         worst = max(beyond, key=lambda i: p.rarity[i])
         rest = [m for m in keys if m != worst]
-        trials = [rest, *([*rest, o] for o in simpler(p, worst))]
-        keys = min(trials, key=lambda t: (len(p.beyond(t)), p.score(t)))
+        trials = [rest, *([*rest, o] for o in simpler_items(p, worst))]
+        keys = min(trials, key=lambda t: (len(p.out_of_bounds(t)), p.score(t)))
     return keys
 
 
-def simpler(p: Problem, i: int) -> list[int]:
+def simpler_items(p: Problem, i: int) -> list[int]:
     """:return: items of the same family and place with fewer parameters"""
     name = _SIMPLER.get(p.items[i].candidate.name)
     return [
@@ -104,25 +107,25 @@ def simpler(p: Problem, i: int) -> list[int]:
     ]
 
 
-def simplified(p: Problem, keys: list[int]) -> list[int]:
+def simplify(p: Problem, keys: list[int]) -> list[int]:
     """Replace a member by a simpler one of its family that predicts held-out data as well."""
     for i in list(keys):
-        others = simpler(p, i)
+        others = simpler_items(p, i)
         if not others:
             continue
         rest = [m for m in keys if m != i]
         held = p.held_out(keys)
-        gained, _ = worth(p, p.held_out(rest), held, i)
+        gained, _ = held_out_gain(p, p.held_out(rest), held, i)
         for other in others:
             if not np.isfinite(p.score([*rest, other])):
                 continue
-            lost, t = worth(p, p.held_out([*rest, other]), held, i)
+            lost, t = held_out_gain(p, p.held_out([*rest, other]), held, i)
             if t < _WORSE or lost < max(_NO_MATTER, _EQUIVALENT * gained):
                 keys = [*rest, other]
     return keys
 
 
-def plausible_first(p: Problem, keys: list[int]) -> list[int]:
+def prefer_plausible(p: Problem, keys: list[int]) -> list[int]:
     """
     Among candidates that the data cannot distinguish, choose the one with the best prior odds.
     """
@@ -130,14 +133,14 @@ def plausible_first(p: Problem, keys: list[int]) -> list[int]:
         if i in p.always:
             continue
         rest, held = [m for m in keys if m != i], p.held_out(keys)
-        gained, _ = worth(p, p.held_out(rest), held, i)
-        others = [o for o in equals(p, keys, i, held, gained) if p.rarity[o] < p.rarity[i]]
+        gained, _ = held_out_gain(p, p.held_out(rest), held, i)
+        others = [o for o in equivalents(p, keys, i, held, gained) if p.rarity[o] < p.rarity[i]]
         if others:
             keys = [*rest, min(others, key=lambda o: (p.rarity[o], p.score([*rest, o])))]
     return keys
 
 
-def worth(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> tuple[float, float]:
+def held_out_gain(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> tuple[float, float]:
     """
     :param without: held-out squared errors without a member, shape ``(folds, dof)``
     :param held: with it
@@ -151,7 +154,7 @@ def worth(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> tuple[fl
     return float(x.mean()), float(x.mean() / (x.std(ddof=1) / np.sqrt(len(x)) + 1e-9))
 
 
-def outstanding(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
+def split_hints(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
     """
     An effect that is no larger than the unexplained structure may be a part of that misfit.
 
@@ -206,7 +209,7 @@ def _predictable(p: Problem, weights: np.ndarray, rich: np.ndarray, j: int) -> f
     return float(1.0 - predicted / base) if base > 0.0 else 0.0
 
 
-def equals(
+def equivalents(
     p: Problem, keys: Sequence[int], i: int, held: np.ndarray, gained: float
 ) -> Iterator[int]:
     """
@@ -215,18 +218,18 @@ def equals(
     :return: items in whose place of the member the set is as good
     """
     own, rest = p.score(keys), [m for m in keys if m != i]
-    for other in p.ranking(rest, swaps(p, keys, i))[:_MOST_ALTERNATIVES]:
+    for other in p.ranking(rest, substitutes(p, keys, i))[:_MOST_ALTERNATIVES]:
         if p.items[other].key == p.items[i].key:
             continue
         trial = [*rest, other]
         if p.score(trial) < own + _CLOSE:
-            lost, t = worth(p, p.held_out(trial), held, i)
+            lost, t = held_out_gain(p, p.held_out(trial), held, i)
             few, surely = lost < _EQUIVALENT * gained, t >= _WORSE
             if few or (not surely and lost < _SAME * max(gained, 1e-3)):
                 yield other
 
 
-def swaps(p: Problem, keys: Sequence[int], i: int) -> list[int]:
+def substitutes(p: Problem, keys: Sequence[int], i: int) -> list[int]:
     """:return: items that could be in the place of a member"""
     taken = {p.family(m) for m in keys if m != i}
     own = set(p.joints(i))

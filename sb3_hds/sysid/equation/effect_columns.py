@@ -97,7 +97,7 @@ def nodes_of(
     half = _GAUSS[:, None]
     inside = np.concatenate([before * half, before + (1.0 - before) * half], axis=1)
     shares = np.concatenate([before, before, 1.0 - before, 1.0 - before], axis=1)
-    shares = shares * lasting(made.mass, made.effective, joint, inside)
+    shares = shares * impulse_weights(made.mass, made.effective, joint, inside)
     s = motion.seen * inside
     # A cubic through both ends, of velocities a line.
     position = (2 * s**3 - 3 * s**2 + 1) * q + dt * (s**3 - 2 * s**2 + s) * v
@@ -112,7 +112,9 @@ def nodes_of(
     }
 
 
-def lasting(mass: np.ndarray, effective: np.ndarray, joint: int, places: np.ndarray) -> np.ndarray:
+def impulse_weights(
+    mass: np.ndarray, effective: np.ndarray, joint: int, places: np.ndarray
+) -> np.ndarray:
     r"""
     With a braking rate :math:`r`, a force at the time :math:`s` of an interval :math:`h` leaves
     :math:`e^{-r (h - s)}` of its impulse, and a constant one meets the mass times

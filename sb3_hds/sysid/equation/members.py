@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 
 from sb3_hds.core import Effect
-from sb3_hds.sysid.equation.confirmation import equals, worth
+from sb3_hds.sysid.equation.confirmation import equivalents, held_out_gain
 from sb3_hds.sysid.equation.plausibility import plausibility
 from sb3_hds.sysid.equation.problem import Problem, Solution
 from sb3_hds.sysid.equation.regression import Equation, Item
@@ -67,8 +67,8 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
     base, held, out = p.score(keys, priced=False), p.held_out(keys), []
     own = [i for i in keys if {*p.items[i].free} <= {*found.free, *found.held}]
     beside = {i: [m for m in keys if m != i] for i in own}
-    worths = {i: worth(p, p.held_out(rest), held, i) for i, rest in beside.items()}
-    equal = {i: list(equals(p, keys, i, held, worths[i][0])) for i in own}
+    worths = {i: held_out_gain(p, p.held_out(rest), held, i) for i, rest in beside.items()}
+    equal = {i: list(equivalents(p, keys, i, held, worths[i][0])) for i in own}
     swapped = [[*beside[i], o] for i in own for o in equal[i][:_SWAPPED]]
     others = _weighed(p, keys, [*swapped, *_with_one_more(p, keys, held)])
     for i in own:
@@ -119,7 +119,7 @@ def _with_one_more(p: Problem, keys: Sequence[int], held: np.ndarray) -> list[li
         more
         for more in likely
         if not {*p.items[more[-1]].free} & {*p.solve(more).held}
-        and worth(p, held, p.held_out(more), more[-1])[0] > 0.0
+        and held_out_gain(p, held, p.held_out(more), more[-1])[0] > 0.0
     ]
 
 

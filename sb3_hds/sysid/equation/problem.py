@@ -179,7 +179,7 @@ class Problem:
             theta, inverse = self._least_squares(local, weights[own], inside, self.prior[free])
             if inverse is None:
                 return Solution(np.inf, free, theta, np.zeros((len(free),) * 2), weights, ())
-            if not held and (common := self._stood_in_for(keys, free, inverse)):
+            if not held and (common := self._aliased_nuisance(keys, free, inverse)):
                 return self.solve([i for i in keys if i not in common], total)
             beyond = np.maximum(self.lower[free] - theta, theta - self.upper[free])
             beyond = np.where([c in bounded for c in free], beyond, -np.inf)
@@ -215,7 +215,7 @@ class Problem:
             return np.zeros(len(free)), None
         return theta, inverse / np.outer(size, size)
 
-    def _stood_in_for(
+    def _aliased_nuisance(
         self, keys: Sequence[int], free: Sequence[int], inverse: np.ndarray
     ) -> set[int]:
         """What is refitted anyway, and cannot be told from members: these stand in for it."""
@@ -246,7 +246,7 @@ class Problem:
             return False
         return all(self._inside(i, found) for i in keys)
 
-    def beyond(self, keys: Sequence[int]) -> list[int]:
+    def out_of_bounds(self, keys: Sequence[int]) -> list[int]:
         """:return: members at their bounds, or with sizes that are physically impossible"""
         found = self.solve(keys)
         return [i for i in keys if not self._inside(i, found)]
@@ -277,14 +277,14 @@ class Problem:
         found = self.solve(keys)
         if not self.admissible(keys, found):
             return np.inf
-        rss = self.by_joint(self._judged(found.weights), self.grams.by_joint)
+        rss = self.by_joint(self._with_measured_accelerations(found.weights), self.grams.by_joint)
         n = self.grams.effective
-        left = np.log(np.maximum(rss, 1e-9) / n) - self.taken_away(keys, found)
+        left = np.log(np.maximum(rss, 1e-9) / n) - self.lost_excitation(keys, found)
         prior = float(np.sum(self.prior[found.free] * found.theta**2))
         prices = sum(map(self.price, keys)) if priced else 0.0
         return float(np.sum(n * left)) + prior + prices
 
-    def _judged(self, weights: np.ndarray) -> np.ndarray:
+    def _with_measured_accelerations(self, weights: np.ndarray) -> np.ndarray:
         """
         Coefficients come from smoothed accelerations, or noise would make inertias smaller;
         residuals from measured ones: twice the inertia is twice the noise.
@@ -298,7 +298,7 @@ class Problem:
         on = np.flatnonzero(weights)
         return np.einsum("i,...ik,k->...", weights[on], gram[..., on[:, None], on], weights[on])
 
-    def taken_away(self, keys: Sequence[int], found: Solution) -> np.ndarray:
+    def lost_excitation(self, keys: Sequence[int], found: Solution) -> np.ndarray:
         """
         Twice the logarithm of how much of the equation a set takes away, by joint, at most zero.
 
@@ -319,9 +319,9 @@ class Problem:
             elif item.key in self.drives:
                 change = value.get(item.columns[0], 0.0) * self.drives[item.key]
                 out += 2.0 * np.minimum(0.0, np.log(np.maximum(1.0 + change, _LEAST_LEFT)))
-        return out + np.minimum(0.0, self._quieter(keys, value))
+        return out + np.minimum(0.0, self._change_of_noise(keys, value))
 
-    def _quieter(self, keys: Sequence[int], value: dict[int, float]) -> np.ndarray:
+    def _change_of_noise(self, keys: Sequence[int], value: dict[int, float]) -> np.ndarray:
         """
         :return: twice the logarithm of how large the force of the accelerations' noise is at each
             joint with another inertia, compared with the nominal one
@@ -347,8 +347,8 @@ class Problem:
         out = []
         for fold, beside in zip(self.grams.folds, self._beside, strict=True):
             found = self.solve(keys, beside)
-            rss = self.by_joint(self._judged(found.weights), fold)
-            taken = np.maximum(self.taken_away(keys, found), -6.0)
+            rss = self.by_joint(self._with_measured_accelerations(found.weights), fold)
+            taken = np.maximum(self.lost_excitation(keys, found), -6.0)
             out.append(rss * np.exp(-taken))
         return np.array(out)
 
@@ -383,7 +383,7 @@ class Problem:
         order = np.argsort(gains)[::-1]
         return [pool[k] for k in order if gains[k] > 0.5 * self.cost]
 
-    def carried(self, keys: Sequence[int]) -> np.ndarray:
+    def force_shares(self, keys: Sequence[int]) -> np.ndarray:
         """:return: of each member, the largest share of a joint's force that it carries"""
         found = self.solve(keys)
         return np.array([float(np.max(self.force_of(i, found) / self.force)) for i in keys])

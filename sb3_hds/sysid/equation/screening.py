@@ -8,7 +8,7 @@ import numpy as np
 from sb3_hds.core import AnalyticTwin, Effect, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.sysid.equation.assembly import equation, problem, refuted_by_kinematics
-from sb3_hds.sysid.equation.confirmation import admitted, predictable, retuned, simpler
+from sb3_hds.sysid.equation.confirmation import enforce_bounds, predictable, retune, simpler_items
 from sb3_hds.sysid.equation.members import (
     ByVelocity,
     FrictionCurve,
@@ -79,17 +79,19 @@ class Screened(NamedTuple):
         """:return: the same with simpler members of their families instead of some, or none"""
         rest = [m.item for m in self.members if m.key not in keys]
         left_out = [m.item for m in self.members if m.key in keys]
-        return self._with_items(rest + [o for i in left_out for o in simpler(self.problem, i)[:1]])
+        return self._with_items(
+            rest + [o for i in left_out for o in simpler_items(self.problem, i)[:1]]
+        )
 
     def _with_items(self, items: Sequence[int]) -> "Screened":
         p = self.problem
-        found = admitted(p, retuned(p, [*p.always, *items]))
+        found = enforce_bounds(p, retune(p, [*p.always, *items]))
         return self._replace(members=_members_of(self.hypotheses, p, found))
 
     def sizes_of(self, keys: Collection[str]) -> dict[str, float]:
         """:return: values of the parameters of some members, by full name, solved without others"""
         p, rest = self.problem, [m.item for m in self.members if m.key in keys]
-        items = retuned(p, [*p.always, *rest])
+        items = retune(p, [*p.always, *rest])
         value, found = p.solve(items).value, {}
         for item in (p.items[i] for i in items if i not in p.always):
             if set(item.free) <= value.keys():
@@ -109,14 +111,14 @@ class Screened(NamedTuple):
     def friction_curves(self, keys: Collection[str]) -> tuple[FrictionCurve, ...]:
         """:return: friction against velocity at each joint where causes with these keys have it"""
         p = self.problem
-        return friction_curves(p, self.by_velocity, retuned(p, [*p.always, *self._items_of(keys)]))
+        return friction_curves(p, self.by_velocity, retune(p, [*p.always, *self._items_of(keys)]))
 
     def estimates(self, keys: Collection[str]) -> dict[str, Estimates]:
         """:return: by key of these causes; none where one of them has no column"""
         items = self._items_of(keys)
         if len(items) < len(keys):
             return {}
-        told = _members_of(self.hypotheses, self.problem, retuned(self.problem, items))
+        told = _members_of(self.hypotheses, self.problem, retune(self.problem, items))
         return {m.key: Estimates(self.intervals_of(m), self.doubts_of(m)) for m in told}
 
     def _items_of(self, keys: Collection[str]) -> list[int]:
@@ -219,7 +221,7 @@ def screen(
         left = predictable(p, chosen) > _LEFT
         where = [n for n, much in zip(where, left, strict=True) if much and len(set_of) < 2]
     keys = {m.key for m in set_of}
-    keys |= {p.items[o].key for m in set_of for o in simpler(p, m.item)}
+    keys |= {p.items[o].key for m in set_of for o in simpler_items(p, m.item)}
     if small or len(set_of) < 2:
         keys |= {*(k for m in set_of for k in m.others), *_singles(p), *hints}
         keys |= _without_column(hypotheses, p, moved, where)

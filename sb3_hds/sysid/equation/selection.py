@@ -5,12 +5,12 @@ from collections.abc import Collection
 import numpy as np
 
 from sb3_hds.sysid.equation.confirmation import (
-    confirmed,
-    material,
-    outstanding,
-    plausible_first,
-    simplified,
-    swaps,
+    drop_negligible,
+    drop_unconfirmed,
+    prefer_plausible,
+    simplify,
+    split_hints,
+    substitutes,
 )
 from sb3_hds.sysid.equation.problem import SHARED, Problem
 from sb3_hds.sysid.estimation.candidates import PARAMETER
@@ -32,13 +32,13 @@ def propose(problem: Problem) -> tuple[list[int], list[int]]:
         data confirm; and hints: items that are small beside the unexplained residual
     """
     _, keys = min((_climb(problem, start) for start in _starts(problem)), key=lambda r: r[0])
-    keys = _shared_instead(problem, keys)
-    keys = _shaken(problem, keys)
-    keys = material(problem, keys)
-    keys = simplified(problem, keys)
-    keys = plausible_first(problem, keys)
-    keys = simplified(problem, confirmed(problem, keys))
-    return outstanding(problem, keys)
+    keys = _try_shared(problem, keys)
+    keys = _retry_without_doubtful(problem, keys)
+    keys = drop_negligible(problem, keys)
+    keys = simplify(problem, keys)
+    keys = prefer_plausible(problem, keys)
+    keys = simplify(problem, drop_unconfirmed(problem, keys))
+    return split_hints(problem, keys)
 
 
 # ------------------------------------------------------------------------------ starts
@@ -108,7 +108,7 @@ def _swap(p: Problem, keys: list[int]) -> list[list[int]]:
     trials = []
     for i in (i for i in keys if i not in p.always):
         rest = [m for m in keys if m != i]
-        trials += [[*rest, o] for o in p.ranking(rest, swaps(p, keys, i))[:_SWAPPED]]
+        trials += [[*rest, o] for o in p.ranking(rest, substitutes(p, keys, i))[:_SWAPPED]]
     return trials
 
 
@@ -126,12 +126,12 @@ def _at_all_joints(p: Problem, keys: list[int]) -> list[list[int]]:
         if len(single) > 1 and p.items[single[0]].candidate.slot != PARAMETER:
             taken = {p.family(i) for i in without}
             new = [i for i in single if p.family(i) not in taken]
-            trials.append(_inside_bounds(p, without, new))
+            trials.append(_within_bounds(p, without, new))
         trials += [[*without, i] for i in every if p.place(i) == SHARED]
     return trials
 
 
-def _inside_bounds(p: Problem, keys: list[int], new: list[int]) -> list[int]:
+def _within_bounds(p: Problem, keys: list[int], new: list[int]) -> list[int]:
     while new:
         found = p.solve([*keys, *new])
         value = dict(zip(found.free, found.theta, strict=True))
@@ -142,7 +142,7 @@ def _inside_bounds(p: Problem, keys: list[int], new: list[int]) -> list[int]:
     return [*keys, *new]
 
 
-def _shared_instead(p: Problem, keys: list[int]) -> list[int]:
+def _try_shared(p: Problem, keys: list[int]) -> list[int]:
     """
     Climb again with what all actuators share, such as a late bus, in the place of something at many
     joints: that is better only once the others have made room.
@@ -165,7 +165,7 @@ def _shared_instead(p: Problem, keys: list[int]) -> list[int]:
         score, keys = new_score, new
 
 
-def _shaken(p: Problem, keys: list[int]) -> list[int]:
+def _retry_without_doubtful(p: Problem, keys: list[int]) -> list[int]:
     """
     Climb again without one member at a time, the least plausible first: what was added early may
     stand for two others, and no single move tells.

@@ -63,10 +63,10 @@ def terms(
         pushed = jnp.asarray(np.zeros(q.shape[1]) if push is None else push, jnp.float64)
         if recorded and _remembers(twin):
             given = (jnp.asarray(x, jnp.float64) for x in (q, v, actions))
-            return Terms(*map(np.asarray, _one_after_the_other(twin, params, pushed, *given)))
+            return Terms(*map(np.asarray, _in_sequence(twin, params, pushed, *given)))
         for index, n in portions(len(q)):
             given = (jnp.asarray(x[index], jnp.float64) for x in (q, v, actions))
-            found = _side_by_side(twin, params, pushed, *given)
+            found = _in_parallel(twin, params, pushed, *given)
             parts.append([np.asarray(leaf)[:n] for leaf in found])
     return Terms(*map(np.concatenate, zip(*parts, strict=True)))
 
@@ -169,7 +169,7 @@ def _one_step(
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
-def _side_by_side(
+def _in_parallel(
     twin: Twin, params: Params, push: Array, q: Array, v: Array, actions: Array
 ) -> tuple:
     nothing = memory_of(twin, params, q.dtype)
@@ -178,7 +178,7 @@ def _side_by_side(
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
-def _one_after_the_other(
+def _in_sequence(
     twin: Twin, params: Params, push: Array, q: Array, v: Array, actions: Array
 ) -> tuple:
     obs = twin.observe(State(q[0], v[0], memory_of(twin, params, q.dtype)), params)

@@ -16,8 +16,8 @@ from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.inverse_dynamics import NO_THRESHOLD, Forces, by_inverse_dynamics
-from sb3_hds.sysid.estimation.normal_equations import Spread, covariance_of
-from sb3_hds.sysid.estimation.parameters import Free, free_names, one_each, own_values, tie
+from sb3_hds.sysid.estimation.normal_equations import Uncertainty, covariance_of
+from sb3_hds.sysid.estimation.parameters import Free, free_names, nominal_values, one_each, tie
 from sb3_hds.sysid.estimation.results import Estimate, Fit
 from sb3_hds.sysid.estimation.shooting import Shots, n_free, shots_of
 
@@ -113,7 +113,7 @@ def calibrate(
         wanted,
         shots,
         origin,
-        spread_of(data),
+        channel_deviations(data),
         threshold=threshold,
         prior=prior,
         level=level,
@@ -167,7 +167,7 @@ def fit_windows(
         portion=portion_for(shots.n),
         threshold=threshold,
     )
-    at = evidence.fit(own_values(twin, free), (), n_steps=_FIRST_STEPS)
+    at = evidence.fit(nominal_values(twin, free), (), n_steps=_FIRST_STEPS)
     before, found = at.raw, None
     if elsewhere is not None and np.any(_rms(before) > spread):
         other = elsewhere()
@@ -205,7 +205,7 @@ def _fit_forces(
             f"errors='force' asks for the equation of motion of an AnalyticTwin, and {twin.name} "
             "has more than that, or none. Calibrate the twin without effects, or leave errors out."
         )
-    real, spread = origin >= 0, spread_of(data)
+    real, spread = origin >= 0, channel_deviations(data)
     evidence = Evidence(
         Hypotheses.of_values(twin, free),
         Shots(*(np.asarray(leaf)[real] for leaf in shots)),
@@ -227,7 +227,7 @@ def _fit_forces(
     )
     before, after = (
         evidence.fit(values, (), n_steps=_FIRST_STEPS).raw
-        for values in (own_values(twin, free), found.values)
+        for values in (nominal_values(twin, free), found.values)
     )
     noise = _noise(after, 0, n_free(twin), spread)
     solver = {"noise": noise, "converged": True, "n_steps": 1, "errors": "force"}
@@ -245,7 +245,7 @@ def default_window(data: Trajectories) -> int:
     return min(steps, int(data.lengths.max()))
 
 
-def spread_of(data: Trajectories) -> Float[np.ndarray, " obs"]:
+def channel_deviations(data: Trajectories) -> Float[np.ndarray, " obs"]:
     """:return: standard deviation of each channel over the data, one where it never changes"""
     real = np.concatenate([data.episode(i)[0] for i in range(len(data))])
     spread = real.std(0)
@@ -296,7 +296,7 @@ def _result(
     twin: Twin,
     free: Free,
     values: np.ndarray,
-    spread: Spread,
+    spread: Uncertainty,
     level: float,
     raw: tuple[np.ndarray, np.ndarray],
     **solver: Any,

@@ -279,7 +279,7 @@ class Evidence:
         for own in _in_groups(index, self._width_for(index), len(theta)):
             alone = _LAPACK if uses_lapack(len(h.twin.joints)) else nullcontext()
             with jax.enable_x64(True), alone:
-                found = _look(
+                found = _errors_and_slopes(
                     h.twin,
                     h.names,
                     tuple(h.ties.items()),
@@ -319,7 +319,7 @@ def _in_groups(index: np.ndarray, width: int, nothing: int) -> Iterator[np.ndarr
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICK_COMPILATION)
-def _look(
+def _errors_and_slopes(
     twin: Twin,
     names: tuple[str, ...],
     ties: tuple[tuple[str, tuple[str, ...]], ...],

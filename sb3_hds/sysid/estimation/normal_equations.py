@@ -130,7 +130,7 @@ def damped_step(
     return np.clip(moved, low, high)
 
 
-class Spread(NamedTuple):
+class Uncertainty(NamedTuple):
     """
     :param covariance: of the estimates, shape ``(p, p)``; infinite where they are undetermined
     :param stderr: standard errors, shape ``(p,)``
@@ -158,7 +158,7 @@ def covariance_of(
     scale: Float[np.ndarray, " p"],
     prior: float,
     n_measured: int,
-) -> Spread:
+) -> Uncertainty:
     """
     The sandwich estimator, clustered by recording, or by window where recordings are few.
 
@@ -190,7 +190,7 @@ def covariance_of(
     stderr = np.where(touched, np.inf, stderr)
     covariance = covariance.copy()
     covariance[touched] = covariance[:, touched] = np.inf
-    return Spread(
+    return Uncertainty(
         covariance * np.outer(scale, scale),
         stderr * scale,
         max(n_groups - 1, 1),

@@ -47,7 +47,7 @@ def free_names(twin: Twin, free: Iterable[str] | None) -> tuple[str, ...]:
     return names
 
 
-def each(names: Iterable[str]) -> Free:
+def untied(names: Iterable[str]) -> Free:
     """:return: every parameter by itself"""
     return {name: (name,) for name in names}
 
@@ -85,7 +85,7 @@ def _alike(twin: Twin, name: str) -> tuple[str, float, float, float]:
     return parameter.unit, parameter.lower, parameter.upper, twin.values[name]
 
 
-def own_values(twin: Twin, free: Free) -> Float[np.ndarray, " p"]:
+def nominal_values(twin: Twin, free: Free) -> Float[np.ndarray, " p"]:
     """:return: what the twin has for them"""
     return np.array([twin.values[members[0]] for members in free.values()], float)
 

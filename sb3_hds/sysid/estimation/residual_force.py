@@ -15,7 +15,7 @@ from sb3_hds.core import AnalyticTwin, Params, State, Trajectories, TransformedT
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.effects import NeuralForce, force_of
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.estimation.calibrate import check_fits, default_window, spread_of
+from sb3_hds.sysid.estimation.calibrate import channel_deviations, check_fits, default_window
 from sb3_hds.sysid.estimation.prediction import hold_out, is_better, start_states, window_errors
 from sb3_hds.sysid.estimation.shooting import Shots, places_of, shots_of, simulate
 
@@ -115,7 +115,7 @@ def fit_residual(
     :raises TrajectoryError: if no recording is as long as a window
     """
     check_fits(twin, data)
-    spread = spread_of(data)
+    spread = channel_deviations(data)
     scale = _UNIT_ERROR * spread if noise is None else np.maximum(noise, 1e-3 * spread)
     length = window or default_window(data)
     shots, origin = shots_of(data, length, twin, n_windows, seed)
@@ -240,12 +240,12 @@ def _train(
     weights = single.scales.pop("weights")
     drawn = np.random.default_rng(seed).exponential(size=(n_members, len(learned)))
     drawn *= learned & ~watched
-    chances = jnp.asarray(drawn / drawn.sum(1, keepdims=True), jnp.float32)
+    probabilities = jnp.asarray(drawn / drawn.sum(1, keepdims=True), jnp.float32)
     state = jax.vmap(_optimiser().init)(weights)
     loss_of = lambda w: np.asarray(_watched_loss(twin, key, w, single, jnp.asarray(watched)))  # noqa: E731
     best, best_loss, idle, n_chunks = weights, loss_of(weights), 0, 0
     for k in jax.random.split(jax.random.key(seed), _MOST_CHUNKS):
-        weights, state = _steps(twin, key, weights, state, single, chances, k)
+        weights, state = _steps(twin, key, weights, state, single, probabilities, k)
         loss = loss_of(weights)
         n_chunks += 1
         better = loss < best_loss
@@ -276,7 +276,7 @@ def _steps(
     weights: Any,
     state: Any,
     lesson: Lesson,
-    chances: Float[Array, "members n"],
+    probabilities: Float[Array, "members n"],
     rng: Array,
 ) -> tuple[Any, Any]:
     optimiser = _optimiser()
@@ -285,8 +285,8 @@ def _steps(
         picked, at = jax.tree.map(lambda leaf: leaf[rows], (lesson.shots, lesson.starts))
         return jnp.mean(jax.vmap(partial(_error, twin, key, lesson, own))(picked, at))
 
-    def member(own: Any, state: Any, chance: Array, rng: Array) -> tuple[Any, Any]:
-        rows = jax.random.choice(rng, len(chance), (_BATCH,), p=chance)
+    def member(own: Any, state: Any, probability: Array, rng: Array) -> tuple[Any, Any]:
+        rows = jax.random.choice(rng, len(probability), (_BATCH,), p=probability)
         gradient = jax.grad(loss)(own, rows)
         finite = jnp.all(jnp.array([jnp.isfinite(g).all() for g in jax.tree.leaves(gradient)]))
         gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
@@ -294,9 +294,9 @@ def _steps(
         return optax.apply_updates(own, change), state
 
     def step(carry: Any, rng: Array) -> tuple[Any, None]:
-        keys = jax.random.split(rng, chances.shape[0])
+        keys = jax.random.split(rng, probabilities.shape[0])
         weights, state = carry
-        return jax.vmap(member)(weights, state, chances, keys), None
+        return jax.vmap(member)(weights, state, probabilities, keys), None
 
     return jax.lax.scan(step, (weights, state), jax.random.split(rng, _CHUNK))[0]
 

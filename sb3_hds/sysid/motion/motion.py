@@ -29,7 +29,7 @@ _ENOUGH, _PER_PERIOD = 10_000, 100
 _STILL = 3.0
 
 
-class Moved(NamedTuple):
+class JointMotion(NamedTuple):
     """
     One recording in joint space, every leaf of shape ``(rows, dof)`` but the actions.
 
@@ -64,7 +64,7 @@ class Motion(NamedTuple):
     :param agrees: whether a measured velocity is the derivative of its position
     """
 
-    recordings: tuple[Moved, ...]
+    recordings: tuple[JointMotion, ...]
     origin: np.ndarray
     dt: float
     every: int
@@ -238,16 +238,16 @@ def _differences(q: np.ndarray, dt: float, shift: float, expected: _Expected | N
 
 def _thinned(
     smoothed: tuple[np.ndarray, ...], raw: np.ndarray, actions: np.ndarray, every: int
-) -> Moved:
+) -> JointMotion:
     q, v, a = smoothed
     if every == 1:
-        return Moved(q, v, a, raw, actions)
+        return JointMotion(q, v, a, raw, actions)
     n = len(actions) // every
     rows = slice(0, n * every + 1, every)
     held = actions[: n * every].reshape(n, every, actions.shape[1]).mean(1)
     # A cubic through its neighbours: noise is averaged, motion is not.
     averaged = np.stack([smooth_mean(x, every) for x in raw.T], 1)
-    return Moved(q[rows], v[rows], a[rows], averaged[rows], held)
+    return JointMotion(q[rows], v[rows], a[rows], averaged[rows], held)
 
 
 def smooth_mean(x: np.ndarray, half: int) -> np.ndarray:

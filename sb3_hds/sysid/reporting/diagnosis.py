@@ -322,12 +322,12 @@ class Diagnosis:
         :raises ParameterError: for another ending, or where nothing was simulated
         :raises OSError: if there is no folder to write it in
         """
+        from sb3_hds.sysid.reporting.animation import animate
         from sb3_hds.sysid.reporting.film import write_film
-        from sb3_hds.sysid.reporting.moving import moving_of
 
         if self.pictures is None:
             raise ParameterError(f"Nothing was simulated, so nothing moves: {self.sentence}")
-        return write_film(moving_of(self.believed, self.twin, self.pictures.replay), path)
+        return write_film(animate(self.believed, self.twin, self.pictures.replay), path)
 
     def save_pictures(self, folder: str | os.PathLike[str]) -> list[Path]:
         """

@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_hds.core.trajectories.storage import check_target
 from sb3_hds.errors import ParameterError
-from sb3_hds.sysid.reporting.moving import PLAYERS, Moving
+from sb3_hds.sysid.reporting.animation import PLAYERS, Animation
 
 _INSTALL = "A film needs imageio-ffmpeg and matplotlib: pip install imageio-ffmpeg matplotlib."
 _FRAMES_PER_SECOND = 25
@@ -31,7 +31,7 @@ def check_film(path: str | os.PathLike[str]) -> None:
         raise ImportError(_INSTALL)
 
 
-def write_film(moving: Moving, path: str | os.PathLike[str]) -> Path:
+def write_film(moving: Animation, path: str | os.PathLike[str]) -> Path:
     """
     Write the motion in real time, 25 frames a second, with the joints' errors beside it.
 
@@ -48,7 +48,7 @@ def write_film(moving: Moving, path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def _draw(moving: Moving, path: Path) -> None:
+def _draw(moving: Animation, path: Path) -> None:
     """Encode 1,280 x 720 pixels: the machine on the left, errors of its joints on the right."""
     import imageio_ffmpeg
     from matplotlib import rc_context

@@ -16,9 +16,9 @@ from sb3_hds.errors import ParameterError
 from sb3_hds.sysid.design.result import NextExperiment
 from sb3_hds.sysid.reporting import figures as plots
 from sb3_hds.sysid.reporting import wording
+from sb3_hds.sysid.reporting.animation import animate
 from sb3_hds.sysid.reporting.diagnosis import Diagnosis
 from sb3_hds.sysid.reporting.finding import Finding
-from sb3_hds.sysid.reporting.moving import moving_of
 from sb3_hds.sysid.reporting.printed import COLUMNS, alike_in_words, rows_of
 
 _INSTALL = "A report needs matplotlib and jinja2: pip install 'sb3-hds[report]'."
@@ -114,7 +114,7 @@ def _content(d: Diagnosis) -> dict[str, Any]:
     n = 0 if d.pictures is None else len(np.unique(d.pictures.missing.origin))
     return {
         "d": d,
-        "moving": d.pictures and moving_of(d.believed, d.twin, d.pictures.replay).section(),
+        "moving": d.pictures and animate(d.believed, d.twin, d.pictures.replay).section(),
         "wording": wording,
         "n_recordings": f"{n} recordings" if n > 1 else "its recording",
         "colour": _COLOURS.get(d.verdict, _NO_NAME),

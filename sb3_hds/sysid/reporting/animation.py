@@ -21,7 +21,7 @@ class Player(NamedTuple):
     """
     A motion on the stage.
 
-    :param width: of its capsules, in units of :attr:`Moving.width`
+    :param width: of its capsules, in units of :attr:`Animation.width`
     """
 
     label: str
@@ -46,7 +46,7 @@ _CORNERS = 20
 _SIZE = 100.0
 
 
-class Moving(NamedTuple):
+class Animation(NamedTuple):
     """
     :param time: since the stretch begins [s], shape ``(frames,)``
     :param lines: of each player, both ends of each capsule as they are seen, in the drawing's
@@ -73,7 +73,7 @@ class Moving(NamedTuple):
         return int(np.argmax(np.nan_to_num(gap).max(1)))
 
     def section(self) -> dict[str, Any]:
-        """:return: what the template ``moving.html`` shows: a still, and all frames for scripts"""
+        """:return: what ``animation.html`` shows: a still, and all frames for its script"""
         still = self.still
         share = 100.0 * self.time / (self.time[-1] or 1.0)
         players = [
@@ -123,7 +123,7 @@ def _chart(label: str, errors: np.ndarray, share: np.ndarray) -> dict[str, Any]:
     return {"name": name, "unit": unit.rstrip("]"), "most": most, "curves": curves}
 
 
-def moving_of(believed: Twin, extended: Twin, replay: Replay) -> Moving:
+def animate(believed: Twin, extended: Twin, replay: Replay) -> Animation:
     """
     :param believed: nominal model, which reads positions from observations
     :param extended: the corrected one
@@ -143,7 +143,7 @@ def moving_of(believed: Twin, extended: Twin, replay: Replay) -> Moving:
     frame = _frame_of(np.concatenate([part[0].reshape(-1, 2) for part in (seen_from, outlines)]))
     names = tuple(f"{joint.name} [{joint.unit}]" for joint in believed.joints)
     capsules = ends.shape[2]
-    return Moving(
+    return Animation(
         replay.time[rows] - replay.time[rows[0]],
         frame(seen_from),
         frame(outlines),
