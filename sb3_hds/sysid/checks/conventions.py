@@ -1,6 +1,6 @@
 """
 Is a log written in the model's conventions? Zeros, directions, units and the order of columns are
-tried before any cause: a wrong one is imitated by several right ones.
+checked before any cause is looked for: a wrong convention resembles several causes at once.
 """
 
 import itertools
@@ -17,14 +17,13 @@ from sb3_hds.sysid.equation.assembly import equation, problem
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.motion.motion import JointMotion, Motion
 
-# What nearly every machine has, whatever is wrong with its log.
+# Effects that nearly every machine has, whatever the conventions of its log.
 _ALWAYS = (ViscousFriction, CoulombFriction, ConstantForce)
-# Rows that such a test needs, at most; on fewer, all changes are ranked, and the likeliest tested.
+# Rows of the test, at most; all changes are ranked on fewer, and only the likeliest are tested.
 _ROWS, _FEW_ROWS, _LIKELIEST = 3000, 1000, 4
-# By which factor what is left, in units of the noise, has to be smaller, and what that has to be
-# worth in -2 log likelihood.
+# A change is accepted if it lowers the residual by this factor, and -2 log likelihood by this much.
 _SMALLER, _WORTH = 2.0, 30.0
-# What is left near the noise needs no other convention.
+# Residuals below this multiple of the noise need no other convention.
 _FINE = 2.0
 
 
@@ -32,7 +31,7 @@ class Convention(NamedTuple):
     """
     :param key: kind and place: ``"direction.hinge"``
     :param words: sentences on what differs, and on what to write into the map of columns
-    :param before: what the equation of motion leaves of the log as it is, in units of the noise
+    :param before: residual of the equation of motion with the log as it is, in units of the noise
     :param after: the same with the convention changed
     """
 
@@ -67,9 +66,9 @@ def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Co
     :param twin: nominal model
     :param motion: as measured
     :param nuisances: parameters that are refitted
-    :return: the one change of the whole log under which the equation of motion, with friction and
-        an offset at every joint, leaves far less in units of the sensors' noise; None if there is
-        none, or if the log fits as it is
+    :return: the change of convention under which the residual of the equation of motion, with
+        friction and an offset at every joint, is far smaller; None if there is none, or if the log
+        fits as it is
     """
     if not isinstance(plant_of(twin), AnalyticTwin) or not motion.moves.any():
         return None
@@ -77,12 +76,12 @@ def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Co
     coarse = motion.twin(twin)
     speeds = tuple(motion.speed)
     hypotheses = Hypotheses.about(coarse, _ALWAYS, nuisances, only=_keys(coarse), speeds=speeds)
-    weight, now = _left(hypotheses, motion)
+    weight, now = _residual(hypotheses, motion)
     if np.all(now < _FINE):
         return None
     changes = list(_changes(twin))
     if (few := _fewer(motion, _FEW_ROWS)) is not motion:
-        likely = _by_gain(hypotheses, few, changes, *_left(hypotheses, few))[:_LIKELIEST]
+        likely = _by_gain(hypotheses, few, changes, *_residual(hypotheses, few))[:_LIKELIEST]
         changes = [change for _, change, _ in likely]
     ranked = _by_gain(hypotheses, motion, changes, weight, now)
     if not ranked:
@@ -103,36 +102,36 @@ def _by_gain(
 ) -> list[tuple[float, _Change, np.ndarray]]:
     """
     :param weight: independent rows of each joint
-    :param now: what is left of the log as it is
-    :return: gain in -2 log likelihood, the change, and what is left under it, best first
+    :param now: residual of each joint with the log as it is, in units of the noise
+    :return: gain in -2 log likelihood, the change, and the residuals under it, best first
     """
     found = []
     for change in changes:
-        _, then = _left(hypotheses, _changed(motion, change))
+        _, then = _residual(hypotheses, _changed(motion, change))
         if np.isfinite(then).all():
             ratio = np.maximum(now, 1.0) / np.maximum(then, 1.0)
             found.append((float(weight @ (2.0 * np.log(ratio))), change, then))
     return sorted(found, key=lambda one: -one[0])
 
 
-def what_friction_leaves(twin: Twin, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+def residual_beside_friction(twin: Twin, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """
-    :return: independent rows of each joint, and what friction and an offset leave of its equation
-        of motion, in units of the noise
+    :return: independent rows of each joint, and the residual of its equation of motion with
+        friction and an offset, in units of the noise
     """
     motion = _fewer(motion)
     known = Hypotheses.about(
         motion.twin(twin), _ALWAYS, (), only=_keys(twin), speeds=tuple(motion.speed)
     )
-    return _left(known, motion)
+    return _residual(known, motion)
 
 
 def _keys(twin: Twin) -> set[str]:
     return {f"{kind.name}.{joint.name}" for kind in _ALWAYS for joint in twin.joints}
 
 
-def _left(hypotheses: Hypotheses, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """:return: independent rows, and what is left in units of the noise, of each joint"""
+def _residual(hypotheses: Hypotheses, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """:return: independent rows of each joint, and its residual in units of the noise"""
     made = equation(hypotheses, motion, quick=True)
     p = problem(hypotheses, made)
     keys = list(range(len(p.items)))
@@ -208,7 +207,7 @@ def _changed(motion: Motion, change: _Change) -> Motion:
 
 
 def _fewer(motion: Motion, most: int = _ROWS) -> Motion:
-    """Stretches of each recording, so many rows in all."""
+    """The beginning of each recording, about ``most`` rows in all."""
     n = sum(len(r.actions) for r in motion.recordings)
     if n <= most:
         return motion

@@ -24,15 +24,16 @@ from sb3_hds.sysid.estimation.shooting import Shots, n_free, shots_of
 # Length of a window where none is given [s], within these numbers of steps.
 _WINDOW = 0.5
 _SHORTEST, _LONGEST = 5, 50
-# Noise that the first pass assumes, and the least believed, in shares of a channel's spread.
+# Noise that the first pass assumes, and the least noise, in shares of a channel's standard
+# deviation.
 _FIRST_NOISE, _LEAST_NOISE = 0.05, 1e-7
 # Huber's threshold, in units of the noise: 95 % as efficient as least squares on Gaussian noise.
 _HUBER = 1.345
 _PASSES = 3
-# Steps of start states alone. A step that lowers the log likelihood by less is the last: it moves
-# estimates by a fraction of their standard errors.
+# Steps that fit start states alone. The search ends with a step that changes the log likelihood by
+# less than this: it moves estimates by a fraction of their standard errors.
 _FIRST_STEPS, _LEAST_STEP = 8, 1e-3
-# An estimate this close to a bound lies on it, in units of its scale.
+# An estimate this close to a bound counts as on it, in units of its scale.
 _ON_BOUND = 1e-3
 # From this ratio of two intervals on, one is taken to be in another unit.
 _OTHER_UNIT = 100.0
@@ -79,8 +80,8 @@ def calibrate(
     :param prior: strength of a normal prior around the twin's own values: the reciprocal of its
         standard deviation, in units of each parameter's ``scale``. 0: no prior.
     :param level: of the confidence intervals
-    :param n_windows: number of windows that are used: a random choice of more, or a compiled
-        program for more than there are; default: all
+    :param n_windows: number of windows: a random choice if there are more, padding if there are
+        fewer, so that one compiled program serves both; default: all
     :param max_steps: of the solver
     :param seed: of the choice of windows
     :return: estimates with standard errors and units, and the calibrated twin
@@ -127,7 +128,7 @@ def fit_windows(
     free: Free,
     shots: Shots,
     origin: np.ndarray,
-    spread: Float[np.ndarray, " obs"],
+    deviations: Float[np.ndarray, " obs"],
     *,
     threshold: float = _HUBER,
     prior: float = 0.0,
@@ -142,11 +143,11 @@ def fit_windows(
     :param free: parameters, by the name of the value that they take
     :param shots: windows; those of weight zero do not count
     :param origin: recording of each window, shape ``(n,)``
-    :param spread: standard deviation of each channel over the data
+    :param deviations: standard deviation of each channel over the data
     :param threshold: of the Huber loss, in units of the noise
     :param believed: centre of the prior; default: the twin's own values
-    :param elsewhere: another start of the search, used if simulations with the twin's own values
-        err by more than a channel's standard deviation
+    :param elsewhere: computes another start of the search, used if the errors of simulations with
+        the twin's own values exceed a channel's standard deviation
     :raises CalibrationError: for fewer measurements than unknowns
     """
     real = origin >= 0
@@ -162,14 +163,14 @@ def fit_windows(
     evidence = Evidence(
         Hypotheses.of_values(twin, free, believed, prior),
         kept,
-        _FIRST_NOISE * spread,
+        _FIRST_NOISE * deviations,
         width=len(free),
         portion=portion_for(shots.n),
         threshold=threshold,
     )
     at = evidence.fit(nominal_values(twin, free), (), n_steps=_FIRST_STEPS)
     before, found = at.raw, None
-    if elsewhere is not None and np.any(_rms(before) > spread):
+    if elsewhere is not None and np.any(_rms(before) > deviations):
         other = elsewhere()
         there = other and evidence.fit(other.values, (), n_steps=_FIRST_STEPS)
         if there and there.cost < at.cost:
@@ -177,7 +178,7 @@ def fit_windows(
     for _ in range(_PASSES):
         found = evidence.solve(at.theta, range(len(free)), at.offsets, max_steps, least=_LEAST_STEP)
         at = found.point
-        noise = _noise(at.raw, len(free), n_free(twin), spread)
+        noise = _noise(at.raw, len(free), n_free(twin), deviations)
         evidence = evidence.with_noise(noise)
     assert found is not None
     at = evidence.fit(at.theta, (), at.offsets, n_steps=_FIRST_STEPS)
@@ -205,11 +206,11 @@ def _fit_forces(
             f"errors='force' asks for the equation of motion of an AnalyticTwin, and {twin.name} "
             "has more than that, or none. Calibrate the twin without effects, or leave errors out."
         )
-    real, spread = origin >= 0, channel_deviations(data)
+    real, deviations = origin >= 0, channel_deviations(data)
     evidence = Evidence(
         Hypotheses.of_values(twin, free),
         Shots(*(np.asarray(leaf)[real] for leaf in shots)),
-        _FIRST_NOISE * spread,
+        _FIRST_NOISE * deviations,
         width=0,
         portion=portion_for(shots.n),
         threshold=threshold,
@@ -229,7 +230,7 @@ def _fit_forces(
         evidence.fit(values, (), n_steps=_FIRST_STEPS).raw
         for values in (nominal_values(twin, free), found.values)
     )
-    noise = _noise(after, 0, n_free(twin), spread)
+    noise = _noise(after, 0, n_free(twin), deviations)
     solver = {"noise": noise, "converged": True, "n_steps": 1, "errors": "force"}
     return _result(twin, free, found.values, uncertainty, level, (before, after), **solver)
 
@@ -248,8 +249,8 @@ def default_window(data: Trajectories) -> int:
 def channel_deviations(data: Trajectories) -> Float[np.ndarray, " obs"]:
     """:return: standard deviation of each channel over the data, one where it never changes"""
     real = np.concatenate([data.episode(i)[0] for i in range(len(data))])
-    spread = real.std(0)
-    return np.where(spread > 0.0, spread, 1.0)
+    deviations = real.std(0)
+    return np.where(deviations > 0.0, deviations, 1.0)
 
 
 def check_fits(twin: Twin, data: Trajectories) -> None:
@@ -283,20 +284,20 @@ def check_fits(twin: Twin, data: Trajectories) -> None:
 
 
 def _noise(
-    raw: np.ndarray, n_params: int, n_start: int, spread: np.ndarray
+    raw: np.ndarray, n_params: int, n_start: int, deviations: np.ndarray
 ) -> Float[np.ndarray, " obs"]:
-    """Standard deviation of each channel's error, by the median, so that outliers do not matter."""
+    """Robust standard deviation of each channel's error, from the median."""
     error = raw.reshape(-1, raw.shape[-1])
     freedom = error.size / max(error.size - n_params - n_start * len(raw), 1)
     noise = 1.4826 * np.median(np.abs(error), 0) * np.sqrt(freedom)
-    return np.maximum(noise, _LEAST_NOISE * spread)
+    return np.maximum(noise, _LEAST_NOISE * deviations)
 
 
 def _result(
     twin: Twin,
     free: Free,
     values: np.ndarray,
-    spread: Uncertainty,
+    uncertainty: Uncertainty,
     level: float,
     raw: tuple[np.ndarray, np.ndarray],
     **solver: Any,
@@ -306,10 +307,10 @@ def _result(
     :param solver: what :class:`Fit` says of the solver, and the noise
     """
     groups = tuple(free.values())
-    margin = spread.quantile(level) * spread.stderr
+    margin = uncertainty.quantile(level) * uncertainty.stderr
     estimates = []
     for (name, group), x, stderr, half in zip(
-        free.items(), values, spread.stderr, margin, strict=True
+        free.items(), values, uncertainty.stderr, margin, strict=True
     ):
         parameter = twin.parameters[group[0]]
         room = min(x - parameter.lower, parameter.upper - x)
@@ -329,20 +330,20 @@ def _result(
     return Fit(
         twin=twin.with_parameters(**one_each(groups, values.tolist())),
         estimates=tuple(estimates),
-        covariance=spread.covariance,
+        covariance=uncertainty.covariance,
         channels=tuple((channel.name, channel.unit) for channel in twin.channels),
         error_before=_rms(before),
         error_after=_rms(after),
         n_windows=len(after),
         window=after.shape[1] - 1,
-        n_groups=spread.n_groups,
+        n_groups=uncertainty.n_groups,
         level=level,
-        undetermined=tuple(_combination(tuple(free), row) for row in spread.undetermined),
+        undetermined=tuple(_combination(tuple(free), row) for row in uncertainty.undetermined),
         **solver,
     )
 
 
 def _combination(names: tuple[str, ...], direction: np.ndarray) -> str:
-    """Which parameters a direction that the data do not determine consists of."""
+    """:return: the parameters that make up an undetermined direction, the largest share first"""
     share = np.abs(direction)
     return ", ".join(names[i] for i in np.argsort(-share) if share[i] > 0.1)

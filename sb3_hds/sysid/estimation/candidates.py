@@ -19,18 +19,18 @@ from sb3_hds.effects import (
 from sb3_hds.errors import EffectError
 from sb3_hds.sysid.motion.joints import encoders
 
-# Longest delay, in periods of the motion, and the speed below which dry friction is smoothed, in
-# root mean square ones.
+# Longest delay, in periods of the motion; speed below which dry friction is smoothed, in units of
+# the root mean square speed.
 _LATEST, _STANDSTILL = 0.3, 0.01
 
 #: the slot of a twin's own parameter, beside those of effects
 PARAMETER = "parameter"
 
-#: where something acts that all actuators share
+#: place of an effect that all actuators share
 EVERY = "all"
-# What they may share: a bus, a controller.
+# Effects that they may share: those of a bus or a controller.
 _SHARED = ("action_delay", "motor_lag")
-# What a velocity takes over from the position that it is derived from.
+# Effects of an encoder that also act on the velocity derived from it.
 _DERIVED = ("sensor_scale", "sensor_delay")
 _OF_DIRECTION = "The direction of the joint is taken the wrong way round, in position and velocity."
 
@@ -87,7 +87,7 @@ class Candidate:
 
 
 def single_keys(keys: Collection[str], twin: Twin) -> set[str]:
-    """:return: keys of what is attached: of a cause at several places, what is at each"""
+    """:return: keys of single effects: of a candidate at several places, those at each of them"""
     found = set(keys)
     for key in keys:
         name, _, place = key.partition(".")
@@ -101,7 +101,7 @@ def single_keys(keys: Collection[str], twin: Twin) -> set[str]:
 def options_for(
     period: float, speeds: Sequence[float], kind: type[Effect], place: int
 ) -> dict[str, float]:
-    """Scales of the motion in the place of seconds and radians that suit most machines."""
+    """:return: options of an effect that depend on the scales of the motion"""
     if issubclass(kind, ActionDelay | SensorDelay):
         return {"longest": _LATEST * period}
     if issubclass(kind, DryFriction) and len(speeds) and speeds[place] > 0.0:
@@ -115,7 +115,13 @@ def attach(
     kept: Callable[[type[Effect], str], bool],
     options: Callable[[type[Effect], int], dict[str, float]],
 ) -> tuple[Twin, list[Candidate]]:
-    """Every effect that is wanted at every place where it is not already."""
+    """
+    Attach every effect at every place where it is not already.
+
+    :param kept: whether an effect is tried at a place
+    :param options: of an effect at the place of this index
+    :return: the extended twin, and the candidates
+    """
     there = {a.key for a in attached_of(twin)}
     wanted: list[Effect] = []
     places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
@@ -149,7 +155,7 @@ def attach(
 
 
 def _shared(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]:
-    """One bus or one power supply behind all actuators: one size for all of them."""
+    """Effects of a bus or a power supply behind all actuators: one size for all of them."""
     found = _of_encoders(twin, candidates)
     for name in _SHARED:
         own = [c for c in candidates if c.name == name and c.slot == "actuator"]
@@ -159,7 +165,7 @@ def _shared(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _of_encoders(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]:
-    """What is wrong with a sensor is wrong with the velocity, too, that is derived from it."""
+    """Errors of an encoder that act on its position and on the velocity derived from it."""
     found = []
     for j, encoder in encoders(twin).items():
         for name in _DERIVED:
@@ -174,7 +180,7 @@ def _of_encoders(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]
 def ties_of(
     twin: Twin, candidates: Sequence[Candidate], single: Sequence[Candidate]
 ) -> dict[str, tuple[str, ...]]:
-    """:return: by the name of a shared number, the parameters that take it"""
+    """:return: by the name of a shared value, the parameters that take it"""
     found = {}
     for shared in candidates:
         if shared.place == EVERY:

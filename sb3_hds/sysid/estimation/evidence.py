@@ -1,4 +1,4 @@
-"""Fits of hypotheses to windows of data: multiple shooting, by one compiled program for all."""
+"""Multiple shooting: fit hypotheses to windows of data, all by one compiled program."""
 
 import dataclasses
 import os
@@ -28,17 +28,18 @@ from sb3_hds.sysid.estimation.normal_equations import (
 from sb3_hds.sysid.estimation.shooting import Shots, n_steps_of, simulate, with_slopes
 from sb3_hds.sysid.motion.joints import first_offsets
 
-# Beyond this, in units of the noise, an error counts in proportion, not by its square.
+# Threshold of Huber's loss, in units of the noise.
 _HUBER = 3.0
 # Damping of the first step, relative to the curvature, how it changes, and where it ends.
 _DAMPING, _LESS, _MORE, _MOST_DAMPING = 1e-3, 0.2, 8.0, 1e6
 # A step that lowers the cost by a smaller share than this is the last.
 _ENOUGH = 1e-4
-# Steps after which a fit that has to beat another ends if its cost is so many times as large. Of 49
-# such fits on two machines of two joints, none came closer by more than a factor of 3.6 after its
-# third step, and those that did better than the other had 1.2 times its cost by then, or less.
+# Steps after which a fit that has to beat another is given up if its cost is this many times
+# larger. Of 49 such fits on two machines of two joints, none came closer by more than a factor of
+# 3.6 after its third step, and those that did better than the other had 1.2 times its cost by then,
+# or less.
 _HOPELESS = ((3, 30.0), (8, 5.0))
-# Most windows that are simulated at a time, and of what their number is a multiple.
+# Most windows that are simulated at a time, and the number of which theirs is a multiple.
 _PORTION, _ROUND = 64, 8
 # Steps of all windows, or joints, beyond which a second program, for start states alone, is worth
 # compiling: 8 s for one joint with all its effects, as 50 passes over so many steps take.
@@ -106,8 +107,7 @@ class Evidence:
     :param width: most parameters that move at a time
     :param rows: whether a row of a window counts, shape ``(steps + 1,)``; default: all do
     :param portion: windows that are simulated at a time: one program serves data of every size
-    :param threshold: beyond which an error counts in proportion, not by its square, in units of the
-        noise
+    :param threshold: of Huber's loss, in units of the noise
     """
 
     hypotheses: Hypotheses
@@ -155,7 +155,7 @@ class Evidence:
         :param n_steps: at most
         :param enough: a step that lowers the cost by a smaller share than this is the last
         :param least: so is one that lowers it by less than this
-        :param rival: the cost to come below: a fit that stays far above it is given up
+        :param rival: cost of the fit to beat: one that stays far above it is given up
         """
         h, moving = self.hypotheses, np.array(free, int)
         low, high, size = h.lower[moving], h.upper[moving], h.scale[moving]
@@ -175,7 +175,7 @@ class Evidence:
             ahead = offsets + step.from_score + step.from_step @ z
             then = self._blocks(new, moving, ahead)
             if not len(moving):
-                # Start states of different windows have nothing to do with each other.
+                # Start states of different windows are independent.
                 better = then.cost < now.cost
                 gained = np.sum((now.cost - then.cost)[better])
                 offsets = np.where(better[:, None], ahead, offsets)
@@ -235,7 +235,7 @@ class Evidence:
 
     @cached_property
     def _portions(self) -> list[tuple[Shots, slice]]:
-        """Windows, some at a time, the last ones filled up."""
+        """Windows, some at a time, the last ones padded."""
         found = []
         with jax.enable_x64(True):
             for first in range(0, self.shots.n, self.portion):
@@ -253,7 +253,7 @@ class Evidence:
         """:return: steps before a window in which memory must be filled under these parameters"""
         h = self.hypotheses
         active = theta != h.null
-        # What is absent remembers nothing, but its slope may need the last few commands.
+        # An effect at its null needs no memory, but its slope may need the last few commands.
         begins = np.where(active, h.forgets, np.minimum(h.forgets, Effect.forgets * h.period))
         active[index] = True
         longest = max(h.always, float(begins[active].max(initial=0.0)))
@@ -302,7 +302,7 @@ class Evidence:
 
 def in_threads(work: Callable[[_Given], _Told], given: Sequence[_Given]) -> Iterator[_Told]:
     """
-    As ``map``. Compiled programs leave the interpreter free, so threads share the cores.
+    Like ``map``, in threads: compiled programs release the interpreter lock.
     """
     if len(given) == 1:
         yield work(given[0])
@@ -312,7 +312,7 @@ def in_threads(work: Callable[[_Given], _Told], given: Sequence[_Given]) -> Iter
 
 
 def _in_groups(index: np.ndarray, width: int, nothing: int) -> Iterator[np.ndarray]:
-    """Indices, so many at a time, the last ones filled up by one that names nothing."""
+    """Indices, ``width`` at a time, the last ones padded with ``nothing``."""
     for first in range(0, max(len(index), 1), max(width, 1)):
         own = index[first : first + width]
         yield np.concatenate([own, np.full(width - len(own), nothing)])
@@ -333,9 +333,9 @@ def _errors_and_slopes(
     chosen: Chosen | None,
 ) -> tuple[Array, Array, Array]:
     """
-    :param ties: parameters that share one number, by the name of that number
-    :param n_lead: steps before each window that matter to what is remembered
-    :param chosen: the effects that may do something under these parameters; None: all
+    :param ties: parameters that share one value, by the name of that value
+    :param n_lead: steps before each window that fill the memory
+    :param chosen: the effects that may be active under these parameters; None: all
     :return: simulated minus measured, and its slopes by start state and by the parameters that
         ``index`` names (in units of their scale)
     """
@@ -343,7 +343,7 @@ def _errors_and_slopes(
 
     def one(offset: Array, shot: Shots) -> tuple[Array, Array, Array]:
         def of(both: Array) -> Array:
-            # The last place takes what belongs to no parameter.
+            # The last place takes the padding.
             step = jnp.zeros(len(names) + 1, theta.dtype).at[index].set(both[n:])
             values = theta + scale * step[:-1]
             params = fixed | {name: values[i] for i, name in enumerate(names)}

@@ -1,4 +1,4 @@
-"""All hypotheses in one model: every candidate attached, each switched on by its parameters."""
+"""All hypotheses in one model: every candidate is attached, and its parameters switch it on."""
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
@@ -35,22 +35,22 @@ _OF_PARAMETER = "The twin's {} is not that of the system."
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hypotheses:
     """
-    A twin with every candidate attached, all at the value at which they change nothing.
+    A twin with every candidate attached, all at the values at which they have no effect.
 
     :param believed: nominal model
     :param twin: extended by all effects
-    :param candidates: what may be named
-    :param names: all parameters that may move, nuisances first
-    :param null: their values when nothing is wrong, shape ``(p,)``
+    :param candidates: causes that may be named
+    :param names: all parameters that may be fitted, nuisances first
+    :param null: their values under the nominal model, shape ``(p,)``
     :param scale: their typical deviations from it
     :param lower: smallest admissible values
     :param upper: largest admissible values
     :param nuisances: indices of those that are refitted under every hypothesis
     :param prior: standard deviation of the prior of each nuisance around its value in ``null``;
         infinite for all other parameters
-    :param pushes: index of a constant force at each joint, to measure what force is missing
+    :param pushes: index of a constant force at each joint, to measure the residual force
     :param nameless: flexible forces: never a finding, but findings have to beat them
-    :param ties: parameters of which one number is shared, by the name of that number
+    :param ties: parameters that share one value, by the name of that value
     :param period: of the motion [s]
     :param starts: for candidates by key, values by full name at which a search may begin
     """
@@ -87,7 +87,7 @@ class Hypotheses:
         :param effects: classes that are tried at every place
         :param only: keys of the candidates that are kept; default: all
         :param nameless_at: joints at which flexible forces are tried; default: all
-        :param period: of the motion [s]: what is later than a third of it is no delay
+        :param period: of the motion [s]: delays are at most 0.3 of it
         :param speeds: root mean square velocity of each joint, in which dry friction is smoothed;
             default: as the effects have it
         :param calibrate: nuisance parameters, which are no findings; see
@@ -143,7 +143,7 @@ class Hypotheses:
         lower = np.array([every[name].lower for name in moving], float)
         for i, name in enumerate(moving):
             if name in native and every[name].null == 0.0:
-                # The twin has some of it already: there may be less than it believes.
+                # The twin has some of it already, and the truth may be less.
                 lower[i] = twin.parameters[native[name]].lower - twin.values[native[name]]
         upper = np.array([every[name].upper for name in moving], float)
         prior = np.full(len(moving), np.inf)
@@ -221,7 +221,7 @@ class Hypotheses:
         return np.array([found.get(self._single(name), 0.0) for name in self.names])
 
     def parameter(self, name: str) -> Parameter:
-        """:return: unit, scale and bounds of a parameter, or of a number that several share"""
+        """:return: unit, scale and bounds of a parameter, or of a value that several share"""
         return self.twin.parameters[self._single(name)]
 
     def _single(self, name: str) -> str:
@@ -230,9 +230,9 @@ class Hypotheses:
     def chosen(self, theta: Float[np.ndarray, " p"], index: Int[np.ndarray, " k"]) -> Chosen | None:
         """
         :param theta: all parameters, shape ``(p,)``
-        :param index: of those by which slopes are taken; others than parameters name nothing
-        :return: the effects that are not null, or whose slopes are asked for; None for all, where
-            there is no candidate
+        :param index: of those by which slopes are taken; indices beyond them are padding
+        :return: the effects that are not null, or whose slopes are taken; None for all, where there
+            is no candidate
         """
         if not self.candidates:
             return None
@@ -250,7 +250,7 @@ class Hypotheses:
 
     @cached_property
     def always(self) -> float:
-        """:return: the same for what the nominal model remembers [s]"""
+        """:return: after how long the memory of the nominal model is forgotten [s]"""
         return remembered_for(self.believed, self.period)
 
     def effect_of(self, candidate: Candidate) -> Effect | None:

@@ -6,9 +6,9 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
-# Stands for the error of a simulation that is not finite, in units of the noise.
+# Error of a simulation that is not finite, in units of the noise.
 _NOT_FINITE = 1e4
-# Added to curvatures, relative to their trace, so that what moves nothing stays where it is.
+# Added to curvatures, relative to their trace, so that parameters without influence stay.
 _RIDGE = 1e-9
 # With fewer recordings than this more than there are parameters, windows count as independent.
 _FEWEST_RECORDINGS = 12
@@ -29,7 +29,7 @@ class Blocks(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Normal equations with the start states eliminated, and how those follow."""
+    """Normal equations with the start states eliminated, and how the start states follow."""
 
     curvature: np.ndarray
     scores: np.ndarray
@@ -37,7 +37,7 @@ class Step(NamedTuple):
     from_step: np.ndarray
 
 
-# States that grow beyond any bound are counted as errors of a fixed size: they need no warning.
+# States that diverge count as errors of a fixed size: no warning is needed.
 @np.errstate(over="ignore", invalid="ignore")
 def normal_equations(
     raw: np.ndarray,
@@ -114,9 +114,8 @@ def damped_step(
     damping: float,
 ) -> np.ndarray:
     """
-    Where the damped step leads; what would leave its bounds stays.
-
     :param pull: curvature and slope of the prior
+    :return: the parameters after the damped step; those at a bound that would leave it stay
     """
     curvature = step.curvature.sum(0) + np.diag(pull[0])
     score = step.scores.sum(0) + pull[1]
@@ -166,7 +165,7 @@ def covariance_of(
     Human Resources 50(2), 2015, sections II and VI (CR1 correction, t with G - 1).
 
     :param curvature: of the cost, start states eliminated, parameters in units of their scale
-    :param scores: slopes of the cost of each window, likewise
+    :param scores: slopes of the cost of each window, in the same units
     :param origin: recording of each window
     :param scale: typical deviation of each parameter
     :param prior: reciprocal of the standard deviation of each parameter's prior, in units of its

@@ -1,4 +1,4 @@
-"""Learn the force that a twin lacks: an ensemble, on errors over several steps."""
+"""Learn the residual force of a twin: an ensemble of networks, on errors over several steps."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,20 +19,20 @@ from sb3_hds.sysid.estimation.calibrate import channel_deviations, check_fits, d
 from sb3_hds.sysid.estimation.prediction import hold_out, is_better, start_states, window_errors
 from sb3_hds.sysid.estimation.shooting import Shots, places_of, shots_of, simulate
 
-# Share of a channel's spread that an error of one means, where its noise is not known.
+# Unit of errors where the noise is not known, in standard deviations of a channel.
 _UNIT_ERROR = 0.05
-# Share of the typical inertial force that an output of one means.
+# Unit of the output, in shares of the typical inertial force.
 _OUTPUT = 0.3
 _LEARNING_RATE, _WEIGHT_DECAY = 1e-2, 1e-3
 _BATCH = 32
-# One in so many of the windows to learn from is kept for early stopping.
+# Every n-th training window is a validation window, for early stopping.
 _EVERY = 4
-# Steps between two looks at those windows; after this many looks without gain it stops.
+# Steps between two validations; training stops after this many without gain.
 _CHUNK, _PATIENCE = 50, 6
 _MOST_CHUNKS = 40
-# How often start states are found again, with the force as learned, and learning goes on.
+# Rounds of training; between them, start states are refitted with the force as learned.
 _ROUNDS = 2
-# Beyond this, in units of the channels' scale, an error counts in proportion, not by its square.
+# Threshold of Huber's loss, in units of the channels' scale.
 _OUTLIER = 3.0
 
 
@@ -93,13 +93,13 @@ def fit_residual(
     seed: int = 0,
 ) -> Residual:
     """
-    Attach a learned force to a twin, and keep it only if held-out windows say that it helps.
+    Attach a learned force to a twin, and keep it only if it lowers the errors of held-out windows.
 
-    Each member of the ensemble sees a bootstrap sample of the windows and stops where a quarter of
-    them, kept aside, gets no better. Further windows, seen by neither, decide whether the force is
-    kept. The loss is the error over whole windows, so the force is learned where
-    the simulation goes, and through the integrator that will use it. A force that the twin has
-    already goes on from its weights.
+    Each member of the ensemble trains on a bootstrap sample of the windows, and stops when the
+    errors of validation windows, a quarter of them, stop falling. Further windows, used for
+    neither, decide whether the force is kept. The loss is the error over entire windows, so the
+    force is learned along the simulation and through the integrator that will use it. A force that
+    the twin has already continues from its weights.
 
     :param twin: analytic, extended or not; its values stay as they are
     :param data: measured trajectories, sampled at the twin's ``dt``
@@ -108,15 +108,15 @@ def fit_residual(
     :param caution: see :class:`~sb3_hds.effects.NeuralForce`
     :param window: steps per window; default as for ``calibrate``
     :param noise: standard deviation of each channel's noise, for example ``fit.noise``; default: a
-        twentieth of its spread
+        twentieth of the channel's standard deviation
     :param n_windows: fixed number of windows, see ``calibrate``
     :param seed: of weights, bootstrap and batches
     :raises CalibrationError: for a twin without mass matrix, other channels or another interval
     :raises TrajectoryError: if no recording is as long as a window
     """
     check_fits(twin, data)
-    spread = channel_deviations(data)
-    scale = _UNIT_ERROR * spread if noise is None else np.maximum(noise, 1e-3 * spread)
+    deviations = channel_deviations(data)
+    scale = _UNIT_ERROR * deviations if noise is None else np.maximum(noise, 1e-3 * deviations)
     length = window or default_window(data)
     shots, origin = shots_of(data, length, twin, n_windows, seed)
     rank = np.where(origin < 0, -1, np.searchsorted(np.unique(data.origin), origin))
@@ -147,7 +147,7 @@ def fit_force(
     :func:`fit_residual` on windows that were cut already.
 
     :param shots: windows; those of weight zero do not count
-    :param held: which are kept from learning, shape ``(n,)``
+    :param held: which windows are held out from training, shape ``(n,)``
     :param scale: what an error of one means in each channel
     :raises CalibrationError: for a twin without mass matrix, or too few windows
     """
@@ -231,7 +231,7 @@ def _normalised(
 def _train(
     twin: Twin, key: str, lesson: Lesson, learned: np.ndarray, n_members: int, seed: int
 ) -> tuple[dict[str, Any], int]:
-    """Adam on each member by itself, stopped where windows that it does not see get no better."""
+    """Adam on each member separately, with early stopping on validation windows."""
     rows = np.flatnonzero(learned)
     watched = np.isin(
         np.arange(len(learned)), rows[_EVERY - 1 :: _EVERY] if len(rows) >= _EVERY else rows[-1:]
@@ -321,9 +321,9 @@ def _error(
     start: tuple[Numbers, Numbers],
 ) -> Array:
     """
-    Loss of one window under one member, as if the ensemble were that member alone. What moving the
-    start state could undo does not count: otherwise start states that suit the twin without the
-    force would hide much of what it has to do.
+    Loss of one window under one member, as if the ensemble were that member alone. Errors that
+    moving the start state could undo are projected out: otherwise start states fitted without the
+    force would hide much of what it has to learn.
     """
     offset, basis = start
     alone = jax.tree.map(lambda leaf: leaf[None], own)

@@ -26,7 +26,8 @@ class Estimate:
     :param unit: of all of these
     :param before: value with which the search began
     :param at_bound: whether the estimate lies on a physical bound; standard errors mean little then
-    :param added_to: what the twin has of it already, to which the estimate is added, in ``unit``
+    :param added_to: value that the twin has of it already, to which the estimate is added, in
+        ``unit``
     """
 
     name: str
@@ -46,7 +47,7 @@ class Fit:
     Result of :func:`~sb3_hds.sysid.calibrate`.
 
     :param twin: with the estimated values
-    :param estimates: one for each free parameter, in the order asked for
+    :param estimates: one for each free parameter, in the order given
     :param covariance: of the estimates, shape ``(p, p)``
     :param channels: name and unit of each observation
     :param error_before: root mean square error of each channel over the windows, with the values
@@ -57,8 +58,8 @@ class Fit:
     :param window: steps of each
     :param n_groups: independent clusters: recordings, or windows
     :param level: of the confidence intervals
-    :param converged: whether the solver says so
-    :param n_steps: that it took
+    :param converged: whether the solver converged
+    :param n_steps: of the solver
     :param undetermined: groups of parameters of which the data determine only combinations
     :param errors: that were minimised: ``"simulation"`` or ``"force"``
     """

@@ -13,12 +13,12 @@ from sb3_hds.core import Params, Trajectories, Twin, explicit_euler, semi_implic
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import plant_of
 
-# Samples from which the first velocity is told, and from which it is told whether one is measured.
+# Samples that give the first velocity, and that show whether velocities are measured at all.
 _FEW, _SOME = 5, 50
-# Of a period, over which positions and velocities are compared; errors by which they must be apart,
-# and the share of the speed or scale that matters.
+# Positions and velocities are compared over this share of a period; they disagree by more than this
+# many standard errors and this share of the speed or scale.
 _PART, _SURE, _SCALE = 0.25, 4.0, 0.005
-# Rows before and after each other.
+# All rows but the last, and all but the first.
 _PAIRS = (slice(None, -1), slice(1, None))
 
 
@@ -87,8 +87,8 @@ def first_offsets(
     Where a search for start states begins.
 
     :param params: under which measurements are read; default: the twin's own
-    :return: offsets from what first measurements say: zero, but for velocities that are not
-        observed, which differences of positions tell
+    :return: offsets from the first measurements: zero, except for velocities that are not observed,
+        which come from differences of positions
     """
     q, v, ways = _read(twin, obs[:, :_FEW], twin.params if params is None else params)
     v = np.zeros_like(q) if v[:, 0].any() else _rates(ways, dt)
@@ -133,7 +133,7 @@ def _unwrapped(twin: Twin, q: np.ndarray) -> np.ndarray:
 
 
 def measures_velocity(twin: Twin, data: Trajectories) -> np.ndarray:
-    """Which velocities come from a sensor: where none does, ``infer`` says zero."""
+    """:return: which velocities come from a sensor: without one, ``infer`` returns zero"""
     obs = jnp.asarray(data.episode(0)[0][:_SOME])
     speeds = jax.vmap(lambda row: twin.infer(row, twin.params).v)(obs)
     return np.any(np.asarray(speeds), axis=0)
@@ -141,8 +141,8 @@ def measures_velocity(twin: Twin, data: Trajectories) -> np.ndarray:
 
 def lag_of(twin: Twin) -> float:
     """
-    :return: when a velocity of the twin's is true, in intervals after its position: Euler's rules
-        step the one with the other a sub-step apart
+    :return: when a velocity of the twin is true, in intervals after its position: Euler's rules
+        update one of them with the other from a sub-step before or after
     """
     integrator = getattr(plant_of(twin), "integrator", None)
     if integrator is semi_implicit_euler:

@@ -22,10 +22,10 @@ from sb3_hds.sysid.motion.smoothing import Smoothed, smooth
 
 #: units of commands that are targets of a servo
 SET_POINTS = ("rad", "rad/s", "m", "m/s", "deg", "deg/s")
-# Rows of all recordings that are kept in any case, and samples that a period of the motion needs
-# beyond these: dry friction turns round faster than a joint swings.
+# Rows of all recordings below which none are dropped, and samples per period of the motion
+# otherwise: dry friction reverses faster than a joint swings.
 _ENOUGH, _PER_PERIOD = 10_000, 100
-# Share of a joint's excursion in noise above which it does not move.
+# A joint moves if its excursion exceeds its sensor's noise by this factor.
 _STILL = 3.0
 
 
@@ -60,7 +60,7 @@ class Motion(NamedTuple):
     :param period: of each joint's motion, ``2 pi rms(v) / rms(a)`` [s]
     :param blurred: intervals over which smoothing blurs a start or a stop, of each joint
     :param seen: share of an interval within which the twin's integrator evaluates forces
-    :param turn: of each joint, a whole turn, or infinity where it slides
+    :param turn: of each joint, one turn [rad], or infinity where it slides
     :param agrees: whether a measured velocity is the derivative of its position
     """
 
@@ -172,8 +172,8 @@ _Expected = tuple[np.ndarray, np.ndarray]
 
 def _by_the_model(twin: Twin, data: Trajectories) -> list[_Expected | None]:
     """
-    A servo answers a step of its set point faster than samples follow one another, and no local
-    polynomial has such a corner. Its model has, and what it misses is smooth.
+    A servo follows a step of its set point within a sample, and no local polynomial has such a
+    corner. Its model has, and the residual of the model is smooth.
 
     :return: of each recording; None where commands are no set points, or the model diverges
     """
@@ -212,7 +212,7 @@ def _smoothed(
     shift: float,
     expected: _Expected | None,
 ) -> list[Smoothed]:
-    """:return: each joint, as it moved beside what is expected where that leaves less noise"""
+    """:return: each joint, smoothed relative to the model's prediction where that is less noisy"""
     found = []
     for j in range(q.shape[1]):
         own = smooth(q[:, j], v[:, j] if measured[j] else None, dt, shift)
