@@ -11,13 +11,13 @@ from sb3_hds.core.belief import BeliefTwin
 from sb3_hds.core.trajectories.storage import check_target, write_bytes
 from sb3_hds.sysid.belief.answers import Answers, bounds_of, union
 
-# How often a draw out of its physical bounds is drawn again before it is moved to them.
+# Number of times that a draw out of its physical bounds is repeated before it is clipped to them.
 _TRIES = 50
 _HEAD = """\
 # What measured data leave open about {name}, for domain randomisation.
 # One draw is a row of `draws`: its numbers belong together, in the order of `parameters`. Draw
-# whole rows, each as likely as the others; `mean`, `std`, `low` and `high` (5 % and 95 %) describe
-# one parameter at a time and forget how they go together.
+# entire rows, all equally likely; `mean`, `std`, `low` and `high` (5 % and 95 %) describe one
+# parameter at a time, without correlations.
 """
 
 
@@ -34,7 +34,7 @@ def belief_of(answers: Answers, n: int = 64, seed: int = 0) -> BeliefTwin:
     """
     twin, values, factor = union(answers.answers)
     rng, bounds = np.random.default_rng(seed), bounds_of(twin)
-    # The likeliest answer takes what the others leave.
+    # The likeliest answer has the remaining draws.
     counts = np.maximum(np.round(answers.weights * n).astype(int), 1)
     counts[0] = max(n - counts[1:].sum(), 1)
     origin = np.repeat(np.arange(len(counts)), counts)
@@ -63,21 +63,21 @@ def write_randomisation(belief: BeliefTwin, path: str | os.PathLike[str]) -> Pat
     Write what differs between draws as YAML: ``parameters`` by full name with unit, mean, standard
     deviation and quantiles; ``draws``; and the ``answers`` with their weights.
 
-    :param path: a file of that name is replaced as a whole
+    :param path: of the file; an existing one is replaced
     :return: its path
     :raises OSError: if there is no folder to write it in
     """
     check_target(path)
     names = tuple(belief.base.parameters)
     varied = [names.index(name) for name in belief.varied]
-    told = {
+    described = {
         "twin": belief.name,
         "answers": dict(zip(belief.answers, map(_short, belief.weights), strict=True)),
         "parameters": {names[j]: _described(belief, j) for j in varied},
         "fixed": {name: _short(value) for name, value in belief.values.items()},
         "draws": [[_short(value) for value in row] for row in belief.draws[:, varied]],
     }
-    text = yaml.safe_dump(told, sort_keys=False, default_flow_style=None, width=100)
+    text = yaml.safe_dump(described, sort_keys=False, default_flow_style=None, width=100)
     return write_bytes(path, (_HEAD.format(name=belief.name) + text).encode())
 
 

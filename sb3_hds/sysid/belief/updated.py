@@ -1,10 +1,10 @@
 r"""
-What a new recording says of answers that earlier data left open.
+Bayesian update of the answers that earlier data left open, by new recordings.
 
 Answer :math:`m` predicts it in windows, each from a start state :math:`x_k` of its own, with
-parameters :math:`\theta_m + L_m z`, of which the earlier data say that :math:`z` is standard
-normal. Its likelihood is that of the best :math:`z` and :math:`x`, times the volume of the
-:math:`z` that do nearly as well (Laplace's approximation):
+parameters :math:`\theta_m + L_m z`; given the earlier data, :math:`z` is standard normal. Its
+likelihood is that of the best :math:`z` and :math:`x`, times the volume of nearly as good
+:math:`z` (Laplace's approximation):
 
 .. math::
    -2 \log p_m = \min_{z, x} \frac{1}{c} \sum_k \left\| \frac{y_m(z, x_k) - y}{\sigma} \right\|^2
@@ -35,7 +35,7 @@ from sb3_hds.sysid.estimation.shooting import (
     with_slopes,
 )
 
-# Gauss-Newton steps, and errors beyond which one counts in proportion, in units of the noise.
+# Gauss-Newton steps, and the threshold of Huber's loss, in units of the noise.
 _STEPS, _HUBER = 8, 3.0
 
 
@@ -96,7 +96,7 @@ def _fitted(
         vector = values + factor @ both[:n_z]
         params = {name: vector[i] for i, name in enumerate(names)} | dict(twin.tensors)
         missed = (simulate(twin, params, shot, both[n_z:]) - shot.obs) / noise
-        # Large errors count in proportion: a simulation that is a little off is not that unlikely.
+        # Huber's loss: small errors of the model must not decide.
         size = jnp.abs(missed)
         far = jnp.sqrt(_HUBER * (2.0 * jnp.maximum(size, _HUBER) - _HUBER))
         return jnp.where(size > _HUBER, jnp.sign(missed) * far, missed).ravel()

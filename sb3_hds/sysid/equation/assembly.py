@@ -26,12 +26,12 @@ from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.motion.joints import encoders
 from sb3_hds.sysid.motion.motion import Motion
 
-# Columns below this share of the typical force change nothing.
+# Columns below this share of the typical force are dropped.
 _NOTHING = 1e-9
-# Share of an interval below which a command is not late: how the motion goes on between two samples
-# matters as much.
+# Least delay, in intervals: shorter ones have no more effect than the motion between two samples.
 _LEAST_LATE = 0.03
-# Ranges of the motion by which a spring may rest outside of it: farther away, it is an offset.
+# A spring may rest outside of the range of motion by this share of it: farther away, it is an
+# offset.
 _BEYOND = 0.5
 # Least noise of a velocity, in shares of the fastest joint's speed.
 _QUIETEST = 1e-6
@@ -42,7 +42,7 @@ def equation(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equ
     :param hypotheses: candidates, and the nominal model, at the interval of the motion
     :param motion: of the joints
     :param quick: only the forces of ``CLOSED_FORMS``, which need no compilation, with the mass
-        matrix as it is
+        matrix as effective inertia
     """
     twin, rows = hypotheses.believed, _rows(motion)
     params = twin.params
@@ -92,8 +92,8 @@ def equation(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equ
 
 def refuted_by_kinematics(twin: Twin, motion: Motion) -> set[str]:
     """
-    :return: keys of candidates that concern one of two channels, where the velocity is the
-        derivative of the position: neither has a scale, a sign or a delay of its own
+    :return: keys of candidates at a single channel of an encoder whose velocity is the derivative
+        of its position: neither has a scale, a sign or a delay of its own
     """
     found = set()
     for j, encoder in encoders(twin).items():
@@ -133,7 +133,7 @@ def _add_parameter(
     smooth: np.ndarray,
     typical: float,
 ) -> None:
-    """Minus the derivative of the missing force, by a difference."""
+    """Minus the derivative of the residual force, by a finite difference."""
     twin, (name,) = hypotheses.believed, candidate.parameters
     parameter, value = twin.parameters[name], twin.values[name]
     step = STEP * parameter.scale
@@ -212,7 +212,7 @@ def problem(hypotheses: Hypotheses, equation: Equation) -> Problem:
 
 
 def _rests(equation: Equation, items: Sequence[Item]) -> dict[int, tuple[float, float]]:
-    """Of springs, between which shares of both columns one rests near where the joint moves."""
+    """By item of a spring, shares of both columns between which it rests near the motion."""
     found = {}
     for number, item in enumerate(items):
         if item.candidate.name != "stiffness" or item.rule != "blend":
@@ -236,7 +236,7 @@ def _least_late(equation: Equation, items: Sequence[Item]) -> dict[int, float]:
 
 
 def _bounds(h: Hypotheses, item: Item, name: str) -> tuple[float, float]:
-    """Of a change from the null: what physics allows, and what machines have."""
+    """Bounds of a change from the null, by physics and by what machines have."""
     known = plausibility(item.candidate.name)
     if item.candidate.slot == PARAMETER:
         place = item.candidate.place

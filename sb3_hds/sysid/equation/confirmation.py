@@ -1,4 +1,4 @@
-"""Which members of a set held-out data confirm, what stands for them, and what they leave."""
+"""Confirmation of the members of a set on held-out data, and their equivalents."""
 
 from collections.abc import Iterator, Sequence
 
@@ -8,21 +8,23 @@ from sb3_hds.sysid.equation.problem import SHARED, Problem
 from sb3_hds.sysid.equation.regression import TINY
 from sb3_hds.sysid.equation.weak_form import rich_columns
 
-# A member carries at least this share of a joint's force, and lowers held-out errors by a t of at
-# least this, and so much more for each unit of rarity.
+# Least share of a joint's force that a member carries, least t statistic of its held-out gain, and
+# its increase for each unit of rarity.
 _MATERIAL, _CONFIRMED, _RARE = 0.006, 1.5, 0.9
-# Below that share, one counts that takes this much off the logarithm of what the others leave.
+# Below that share, a member is kept if it lowers the logarithm of the others' residual by this
+# much.
 _TRACE, _MOST_OF_THE_REST = 1e-3, 0.7
-# A member whose force is below this multiple of what stays unexplained is a hint, no more; of what
-# is less rare than this, a smaller one.
+# A member whose force is below this multiple of the unexplained residual is only a hint; the
+# multiple is smaller for effects that are less rare than this.
 _OUTSTANDING, _RAREST = 1.5, 2.0
-# An alternative may score worse by this, and predicts held-out data as well to this t or share.
+# An alternative may score worse by this, and predicts held-out data as well to within this t or
+# share.
 _CLOSE, _WORSE, _SAME = 8.0, 2.0, 0.2
-# Whatever its t, a loss below this share of what the place gains may come from any misfit.
+# Region of practical equivalence: a loss below this share of the member's gain counts as none.
 _EQUIVALENT = 0.05
 _MOST_ALTERNATIVES = 12
-# Members of a family that are another one with more parameters, and the gain in the logarithm of
-# held-out errors that is not worth these.
+# Simpler members of a family, and the gain in the logarithm of held-out errors that does not
+# justify more parameters.
 _SIMPLER = {
     "stribeck_friction": "coulomb_friction",
     "load_dependent_friction": "coulomb_friction",
@@ -32,7 +34,7 @@ _SIMPLER = {
     "directional_gain": "torque_gain",
 }
 _NO_MATTER = 0.02
-# Share of a column that the other folds contain at least, or ridge regression takes it for more.
+# Least share of a column's power in the training folds: below it, ridge regression overestimates.
 _SOME = 0.02
 
 
@@ -78,7 +80,7 @@ def drop_unconfirmed(p: Problem, keys: list[int]) -> list[int]:
 
 
 def retune(p: Problem, keys: list[int]) -> list[int]:
-    """Choose the nonlinear parameters of each member anew, given the other members."""
+    """Choose the nonlinear parameters of each member again, given the other members."""
     for place, i in enumerate(list(keys)):
         if p.items[i].settings and i not in p.always:
             same = [o for o, item in enumerate(p.items) if item.key == p.items[i].key]
@@ -88,7 +90,7 @@ def retune(p: Problem, keys: list[int]) -> list[int]:
 
 
 def enforce_bounds(p: Problem, keys: list[int]) -> list[int]:
-    """Replace members that left their bounds by simpler ones of their family, or remove them."""
+    """Replace members out of their bounds by simpler ones of their family, or remove them."""
     while beyond := [i for i in p.out_of_bounds(keys) if i not in p.always]:
         worst = max(beyond, key=lambda i: p.rarity[i])
         rest = [m for m in keys if m != worst]
@@ -143,9 +145,10 @@ def prefer_plausible(p: Problem, keys: list[int]) -> list[int]:
 def held_out_gain(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> tuple[float, float]:
     """
     :param without: held-out squared errors without a member, shape ``(folds, dof)``
-    :param held: with it
-    :return: mean logarithm of their ratio, and its t over folds, at the member's own joint; where
-        it acts at several, at the one that gains most; of what all actuators share, over all
+    :param held: the same with it
+    :return: mean logarithm of their ratio, and its t statistic over folds, at the member's own
+        joint; at the one that gains most if it acts at several; over all joints if all actuators
+        share it
     """
     ratio = np.log((without + 1e-9) / (held + 1e-9))
     joints = p.joints(i)
@@ -168,7 +171,7 @@ def split_hints(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
         left = share * np.sqrt(np.clip(predictable(p, keys), 0.0, 1.0))
         ratio = []
         for i in keys:
-            # Friction that every joint has stands out sooner than what is rare.
+            # Friction, which every joint has, may be smaller than rare effects.
             least = _OUTSTANDING * (1.0 + min(p.rarity[i], _RAREST)) / (1.0 + _RAREST)
             own = p.force_of(i, found) / p.force / np.maximum(left, 1e-6) / least
             ratio.append(np.inf if i in p.always else float(np.max(own)))
@@ -198,7 +201,7 @@ def _predictable(p: Problem, weights: np.ndarray, rich: np.ndarray, j: int) -> f
     base = predicted = 0.0
     for fold in (fold[np.ix_(on, on)] for fold in p.grams.folds[:, j]):
         train = every - fold
-        # Of what only this fold excites, the others say nothing.
+        # The training folds do not determine what only this fold excites.
         size = np.sqrt(np.maximum(np.diag(train)[rich], _SOME * diagonal[rich])) + TINY
         inner = train[np.ix_(rich, rich)] / np.outer(size, size)
         x = np.linalg.solve(inner + 0.02 * np.eye(len(rich)), (train[rich] @ weights) / size)
@@ -215,7 +218,7 @@ def equivalents(
     """
     :param held: held-out errors of the set
     :param gained: mean logarithm of their ratio without the member
-    :return: items in whose place of the member the set is as good
+    :return: items with which, in place of the member, the set is as good
     """
     own, rest = p.score(keys), [m for m in keys if m != i]
     for other in p.ranking(rest, substitutes(p, keys, i))[:_MOST_ALTERNATIVES]:
@@ -230,7 +233,7 @@ def equivalents(
 
 
 def substitutes(p: Problem, keys: Sequence[int], i: int) -> list[int]:
-    """:return: items that could be in the place of a member"""
+    """:return: items that could take the place of a member"""
     taken = {p.family(m) for m in keys if m != i}
     own = set(p.joints(i))
     return [

@@ -1,4 +1,4 @@
-"""Columns of effects: forces at joints, delayed or distorted commands, misread sensors."""
+"""Columns of effects: forces at joints, delayed or distorted commands, sensor errors."""
 
 import copy
 import dataclasses
@@ -22,11 +22,11 @@ from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.motion.joints import encoders
 
-# Places of a normal distribution, in standard deviations, and their weights (Gauss-Hermite).
+# Nodes for a normal distribution, in standard deviations, and their weights (Gauss-Hermite).
 _PLACES, _WEIGHTS = np.array([0.0, -np.sqrt(3.0), np.sqrt(3.0)]), np.array([4.0, 1.0, 1.0]) / 6.0
-# Places in an interval from 0 to 1, of equal weight (Gauss-Legendre).
+# Nodes in an interval from 0 to 1, of equal weight (Gauss-Legendre).
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
-# Braking below this in an interval is none: Lambert's W has a branch point there.
+# Least braking in an interval: Lambert's W has a branch point at zero.
 _NO_BRAKE = 1e-6
 
 #: by effect, its parameter and the force per unit of it at a velocity
@@ -84,8 +84,8 @@ def nodes_of(
     """
     Quadrature nodes of each interval, over the part that the twin's integrator evaluates: two
     points (Gauss-Legendre) before and after the velocity changes its sign, so that the mean of dry
-    friction is exact; each at three velocities (Gauss-Hermite, for the uncertainty of that moment).
-    Where the model brakes what a force sets in motion, a force counts the more, the later it acts.
+    friction is exact; each at three velocities (Gauss-Hermite), for the uncertainty of that
+    instant. Where the model brakes the motion, a force counts more the later it acts.
     """
     motion, dt = made.motion, made.motion.dt
     ends = rows.q, rows.v, rows.next_q, rows.next_v
@@ -116,14 +116,14 @@ def impulse_weights(
     mass: np.ndarray, effective: np.ndarray, joint: int, places: np.ndarray
 ) -> np.ndarray:
     r"""
-    With a braking rate :math:`r`, a force at the time :math:`s` of an interval :math:`h` leaves
-    :math:`e^{-r (h - s)}` of its impulse, and a constant one meets the mass times
+    With a braking rate :math:`r`, :math:`e^{-r (h - s)}` remains of the impulse of a force at the
+    time :math:`s` of an interval :math:`h`, and a constant force acts on the mass times
     :math:`x / (1 - e^{-x})`, :math:`x = r h`.
 
     :param mass: mass matrices, shape ``(n, dof, dof)``
-    :param effective: what a constant force meets over the interval, likewise
+    :param effective: effective inertias over the interval, shape ``(n, dof, dof)``
     :param places: in the interval, from 0 to 1, shape ``(n, ...)``
-    :return: by what a force there counts more than a constant one does on average
+    :return: weight of a force there, relative to a constant force
     """
     met = np.diagonal(np.linalg.inv(mass) @ effective, axis1=1, axis2=2)[:, joint]
     more = np.maximum(met, 1.0 + _NO_BRAKE)
@@ -137,7 +137,7 @@ def _force_slopes(
 ) -> np.ndarray:
     """:return: derivative of the mean force by each parameter, ``(settings, parameters, n)``"""
     found = []
-    # One program serves all joints: the speed in which they differ is an argument of it.
+    # One program serves all joints: the speed in which they differ is its argument.
     standstill = 0.0
     if isinstance(effect, DryFriction):
         effect, standstill = _standing_still_at(effect, 1.0), effect.standstill
@@ -188,7 +188,7 @@ def add_command(
     effect: ActionEffect,
     rows: Rows,
 ) -> None:
-    """Columns of what delays or distorts commands: changes of the actuators\' force."""
+    """Columns of delayed or distorted commands: changes of the actuators' force."""
     twin, i, dt = hypotheses.believed, candidate.index, made.motion.dt
     if not rows.actions.size or not np.ptp(rows.actions[:, i]) > 0.0:
         return
@@ -222,7 +222,7 @@ def add_command(
 
 
 def add_common(made: Equation, hypotheses: Hypotheses) -> None:
-    """Causes that all actuators share, such as a late bus: sums of the columns of each actuator."""
+    """Effects that all actuators share, such as a bus delay: sums of the columns of each one."""
     for candidate in (c for c in hypotheses.candidates if c.slot == "actuator" and c.index < 0):
         own = [item for item in made.items if item.candidate.name == candidate.name]
         by_settings: dict[str, list[Item]] = {}
@@ -293,7 +293,7 @@ def add_sensor(
     rows: Rows,
     smooth: np.ndarray,
 ) -> None:
-    """Minus the change of the residual force if the channel is read as the effect says."""
+    """Minus the change of the residual force if the channel is corrected for the effect."""
     twin, channels = hypotheses.believed, (candidate.index,)
     if candidate.slot == "joint":
         channels = encoders(twin)[candidate.index].channels
@@ -301,7 +301,7 @@ def add_sensor(
         return
     (name, parameter), *others = effect.parameters.items()
     if others or parameter.upper - parameter.lower == 1.0:
-        return  # a switch is no matter of degree
+        return  # a switch has no size
     with jax.enable_x64(True):
         observed = np.asarray(_observations(twin, jnp.asarray(rows.q), jnp.asarray(rows.v)))
     spread = np.std(observed[:, channels[0]])
@@ -337,7 +337,7 @@ def _reread(
     v: np.ndarray,
     value: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What joints did if a channel reports what the effect makes of it."""
+    """:return: motion of the joints if a channel is corrected for the effect"""
     with jax.enable_x64(True):
         found = _inverted(twin, effect, channels, jnp.asarray(q), jnp.asarray(v), value)
         new_q, new_v = map(np.asarray, found)

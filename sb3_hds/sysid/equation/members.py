@@ -13,12 +13,12 @@ from sb3_hds.sysid.equation.problem import Problem, Solution
 from sb3_hds.sysid.equation.regression import Equation, Item
 
 _CONFIDENCE = 0.9
-# By how much intervals are wider than cluster-robust standard errors make them: a set is hardly
-# ever complete, and sizes shift to make up for what is missing. Chosen on other simulated machines
-# than those of benchmarks/hidden_effects.py, which says what intervals cover.
+# Factor by which intervals are wider than cluster-robust ones: sets are rarely complete, and sizes
+# compensate for what is missing. Chosen on other simulated machines than those of
+# benchmarks/hidden_effects.py, which measures the coverage.
 _INCOMPLETE = 2.0
-# Sets with one more member that count in intervals, at most, and those that are tried; and those in
-# which something else is in the place of a member.
+# Most sets with one more member that widen intervals, sets that are tried, and sets with an
+# equivalent in place of a member.
 _MORE_SETS, _TRIED_SETS, _SWAPPED = 12, 60, 4
 
 # Groups of intervals of similar velocity, and the fewest intervals of a group.
@@ -33,11 +33,11 @@ class Member(NamedTuple):
     :param item: index
     :param key: of the candidate
     :param sizes: by short name; of a parameter of the twin, its change
-    :param low: ends of 90 % intervals, by short name; of what was tried at a few values only, the
-        ones next to it
-    :param high: likewise
-    :param doubt: by short name, half the width of the interval that comes from not knowing whether
-        there is one cause more, or another in the place of a member
+    :param low: lower ends of 90 % intervals, by short name; of a parameter that was tried at a few
+        values only, the next smaller value
+    :param high: upper ends of these intervals
+    :param doubt: by short name, half the width of the interval that is due to model uncertainty:
+        another cause may be present, or stand in place of a member
     :param gain: increase of -2 log likelihood without it
     :param t: t statistic of the held-out gain over folds
     :param others: keys of candidates that predict held-out data as well in its place
@@ -107,8 +107,8 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
 def _with_one_more(p: Problem, keys: Sequence[int], held: np.ndarray) -> list[list[int]]:
     """
     :param held: held-out errors of the set
-    :return: sets in which a further cause is, that was not confirmed, but is within physical bounds
-        and predicts held-out data better
+    :return: sets with one more cause that was not confirmed, but is within physical bounds and
+        improves held-out predictions
     """
     taken = {p.family(i) for i in keys}
     others = [o for o in p.ranking(keys)[:_TRIED_SETS] if p.family(o) not in taken]
@@ -130,7 +130,7 @@ def _weighed(
     Source: Buckland, Burnham, Augustin, *Model selection: an integral part of inference*,
     Biometrics 53, 1997: estimates of several models, weighed by an information criterion.
 
-    :param sets: what may be there instead of a set
+    :param sets: alternatives to a set
     :return: the weight of each, and its coefficients by column
     """
     scores = np.array([p.score(keys), *(p.score(each) for each in sets)])
@@ -151,7 +151,7 @@ def _doubt(
     sizes: Mapping[str, float],
     others: Sequence[tuple[float, Mapping[int, float]]],
 ) -> dict[str, float]:
-    """:return: by short name, half the width of an interval over what other sets estimate"""
+    """:return: by short name, half the width of an interval over the estimates of other sets"""
     squares = dict.fromkeys(sizes, 0.0)
     for weight, value in others:
         if set(item.free) <= value.keys():
@@ -163,7 +163,7 @@ def _doubt(
 
 
 def _tried_beside(p: Problem, i: int) -> dict[str, tuple[float, float]]:
-    """:return: of what stands at one of several values, such as a speed, the values next to it"""
+    """:return: by parameter that was tried at several values, such as a speed, the next values"""
     item = p.items[i]
     if item.rule not in ("linear", "blend") or not item.settings:
         return {}
@@ -180,7 +180,7 @@ def _tried_beside(p: Problem, i: int) -> dict[str, tuple[float, float]]:
 
 
 def _covariance(p: Problem, keys: Sequence[int], found: Solution) -> np.ndarray:
-    """Blocks of data as clusters, never narrower than rows alone would have it."""
+    """Cluster-robust, by blocks of data; variances are at least those of independent rows."""
     if not found.free:
         return np.zeros((0, 0))
     scores = p.grams.blocks[:, found.free] @ found.weights
@@ -212,8 +212,9 @@ class FrictionCurve(NamedTuple):
 
     :param joint: index
     :param velocity: of groups of intervals, ascending, shape ``(groups,)`` [rad/s] or [m/s]
-    :param measured: mean resistance of each group, with all other causes taken off [N m] or [N]
-    :param found: mean of the friction that was named, likewise
+    :param measured: mean resistance of each group, without the force of all other causes [N m] or
+        [N]
+    :param found: mean of the friction that was named [N m] or [N]
     """
 
     joint: int

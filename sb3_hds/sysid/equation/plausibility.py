@@ -1,10 +1,9 @@
 """
-What an engineer would think of first: prior odds, physical limits, and which names exclude each
-other.
+Prior knowledge of an engineer: prior odds, physical limits, and which effects exclude each other.
 
-The odds say how much more often a machine has an effect that its model lacks than one that is given
-as a reference (viscous friction, which every joint has); they decide between explanations that data
-cannot tell apart, and a cause with poor odds has to explain more before it is named at all.
+Odds are relative to viscous friction, which every joint has and few models include. They decide
+between explanations that the data cannot distinguish, and a rarer cause has to explain more before
+it is named.
 """
 
 import functools
@@ -69,7 +68,7 @@ TABLE: dict[str, Plausibility] = {
     "sign_flip": Plausibility("sign", 3.0, reason="wiring, and conventions of others"),
 }
 _UNKNOWN = Plausibility("", 3.0)
-# A set point is a number that arrives as it is, or late: no amplifier changes it.
+# Additional rarity of amplifier effects on set points, which arrive unchanged, if late.
 _SET_POINT = 3.0
 _OF_AMPLIFIERS = ("torque_gain", "directional_gain", "dead_zone", "saturation")
 

@@ -15,17 +15,16 @@ from sb3_hds.sysid.equation.regression import TINY, Item
 from sb3_hds.sysid.equation.weak_form import Grams
 from sb3_hds.sysid.estimation.candidates import PARAMETER
 
-# Variance of a size in units of what it would be alone: beyond that, columns cannot be told apart.
+# Variance inflation of a coefficient beyond which columns count as collinear.
 _MOST_INFLATION = 200.0
-# Least share of changes of the logged command, or of the inertia, that a set may leave.
+# Least share of the logged command or the inertia that counts as left by a set.
 _LEAST_LEFT = 0.02
 _RIDGE = 1e-9
-# Of friction that falls as a joint begins to slide, the least share that stays: what falls further
-# stands for a curve of another form.
+# Least ratio of sliding to static friction: a steeper drop stands for a curve of another form.
 _LEAST_SLIDING = 0.3
-# Numbers that what is not linear costs beside its coefficients: a speed, a period.
+# Nonlinear parameters that cost as much as coefficients: a speed, a period.
 _HIDDEN = {"stribeck_friction": 1, "concave_friction": 1, "cogging": 1}
-# Place of what all actuators have in common.
+# Place of effects that all actuators share.
 SHARED = ("actuator", -1)
 
 
@@ -36,7 +35,7 @@ class Solution(NamedTuple):
     :param theta: coefficients
     :param inverse: of their normal matrix
     :param weights: of all columns in the residual; the last is that of the missing force
-    :param held: columns whose coefficients stand at a bound
+    :param held: columns whose coefficients are at a bound
     """
 
     rss: float
@@ -63,10 +62,10 @@ class Problem:
     :param prior: of each column, the inverse variance of the prior of its coefficient
     :param force: typical force of each joint [N m] or [N]
     :param shares: of each column, its root mean square at each joint, shape ``(dof, columns)``
-    :param passes: of saturations and dead zones, the share of commands that still pass
+    :param passes: of saturations and dead zones, the share of commands that they pass
     :param mass: some mass matrices, shape ``(n, dof, dof)``
     :param noisy: of columns that contain the smoothed acceleration, the one with the measured one
-    :param effective: likewise, effective inertia over an interval
+    :param effective: effective inertia over an interval, in the same rows
     :param noise: of each joint's acceleration, in any unit, shape ``(dof,)``
     :param slopes: of these by inertial parameters, by key
     :param drives: share of each joint's actuator force by parameters, by key
@@ -159,7 +158,7 @@ class Problem:
 
     def solve(self, keys: Sequence[int], total: np.ndarray | None = None) -> Solution:
         """
-        Least squares within bounds: what would leave its bounds, the farthest first, stays there.
+        Least squares within bounds: coefficients out of bounds are fixed there, the farthest first.
 
         :param total: normal equations; default: those of all data
         """
@@ -218,7 +217,7 @@ class Problem:
     def _aliased_nuisance(
         self, keys: Sequence[int], free: Sequence[int], inverse: np.ndarray
     ) -> set[int]:
-        """What is refitted anyway, and cannot be told from members: these stand in for it."""
+        """:return: the nuisance item that is most collinear with members, which replace it"""
         if not len(free):
             return set()
         inflation = dict(zip(free, self._inflation(free, inverse), strict=True))
@@ -286,8 +285,8 @@ class Problem:
 
     def _with_measured_accelerations(self, weights: np.ndarray) -> np.ndarray:
         """
-        Coefficients come from smoothed accelerations, or noise would make inertias smaller;
-        residuals from measured ones: twice the inertia is twice the noise.
+        Coefficients are estimated with smoothed accelerations, since noise would bias inertias
+        towards zero; residuals use the measured ones: twice the inertia has twice the noise.
         """
         smooth, noisy, judged = list(self.noisy), list(self.noisy.values()), weights.copy()
         judged[noisy], judged[smooth] = weights[smooth], 0.0
@@ -300,12 +299,11 @@ class Problem:
 
     def lost_excitation(self, keys: Sequence[int], found: Solution) -> np.ndarray:
         """
-        Twice the logarithm of how much of the equation a set takes away, by joint, at most zero.
+        Twice the logarithm of the share of the equation that a set leaves, by joint, at most zero.
 
         The equation is homogeneous: without torque (a gain of zero, a dead zone as wide as the
-        commands, saturation at the level of dry friction) and without inertia it says that nothing
-        equals nothing, and fits. So residuals count relative to what is left of the logged command
-        and of the inertia.
+        commands, saturation at the level of dry friction) and without inertia it fits trivially,
+        0 = 0. So residuals count relative to the remaining command and inertia.
         """
         out, value = np.zeros(self.dof), found.value
         for i in keys:
@@ -323,8 +321,8 @@ class Problem:
 
     def _change_of_noise(self, keys: Sequence[int], value: dict[int, float]) -> np.ndarray:
         """
-        :return: twice the logarithm of how large the force of the accelerations' noise is at each
-            joint with another inertia, compared with the nominal one
+        :return: twice the logarithm of the force of the accelerations' noise at each joint,
+            relative to that with the nominal inertia
         """
         changes = [
             value.get(self.items[i].columns[0], 0.0) * self.slopes[self.items[i].key]
@@ -353,7 +351,7 @@ class Problem:
         return np.array(out)
 
     def ranking(self, keys: Sequence[int], among: Sequence[int] | None = None) -> list[int]:
-        """:return: items by what they would take off the residual, best first"""
+        """:return: items by how much they would lower the residual, best first"""
         found = self.solve(keys)
         if not np.isfinite(found.rss):
             return []

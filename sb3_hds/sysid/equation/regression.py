@@ -10,7 +10,7 @@ from sb3_hds.core import Effect, Ranges
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.motion.motion import Motion
 
-#: Added to sizes that columns are divided by; its square is not zero.
+#: added to the norms by which columns are divided; its square is not zero
 TINY = 1e-100
 # Finite differences by a parameter or a sensor, in shares of its scale.
 STEP = 1e-3
@@ -96,15 +96,15 @@ class Equation:
     :param load: force that the nominal model transmits: inertia, gravity, shape ``(n, dof)``
     :param actuator: force of the actuators, shape ``(n, dof)``
     :param mass: mass matrix, shape ``(n, dof, dof)``
-    :param effective: effective inertia over an interval, likewise: force over change of velocity,
-        with damping
+    :param effective: effective inertia over an interval, force over change of velocity with
+        damping, shape ``(n, dof, dof)``
     :param columns: what candidates would add
     :param items: candidates, several with different settings
     :param noisy: of columns that contain the acceleration, smoothed, the index of the same column
         with the measured one
     :param slopes: of the mass matrix by inertial parameters, by key of the candidate
-    :param drives: by which share of the actuators' force that changes with a unit of a parameter,
-        at each joint, likewise
+    :param drives: relative change of the actuators' force with a unit of a parameter at each joint,
+        by key of the candidate
     """
 
     motion: Motion
@@ -144,7 +144,7 @@ def put(made: Equation, joint: int | None, values: np.ndarray) -> int:
 
 
 def put_acting(made: Equation, values: np.ndarray) -> int:
-    """:return: index of a new column, at a single joint if it acts at one only"""
+    """:return: index of a new column, at a single joint if it acts at only one"""
     acting = np.flatnonzero(np.abs(values).max(0) > 0.0)
     if len(acting) == 1:
         return put(made, int(acting[0]), values[:, acting[0]])

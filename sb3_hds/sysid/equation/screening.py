@@ -24,16 +24,16 @@ from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.parameters import Belief
 from sb3_hds.sysid.motion.motion import Motion
 
-# Single candidates that are simulated, besides those of the set and what may stand for them, and at
-# least of each joint.
+# Single candidates that are simulated besides the set and its equivalents: in all, and for each
+# joint.
 _SINGLES, _OF_A_JOINT = 10, 5
-# Share of what the nominal model leaves that a cause explains at least, and by how much it has to
-# exceed its price, in -2 log likelihood.
-_TOLD, _SURELY = 0.05, 6.0
+# Detection limit: share of the nominal model's residual that a cause explains, and by how much it
+# exceeds its price, in -2 log likelihood.
+_EXPLAINED, _MARGIN = 0.05, 6.0
 # Share of a joint's force that a typical size changes.
 _TYPICAL = 0.05
-# Machines of more joints are not asked about what has no column at every joint, but where much is
-# left that can be predicted; where they have several causes, only these are simulated.
+# On machines of more joints, candidates without a column are simulated only at joints whose
+# residual is predictable by this share; where there are several causes, only these are simulated.
 SMALL_MACHINE, _LEFT = 2, 0.2
 
 
@@ -42,8 +42,7 @@ class Estimates(NamedTuple):
     Sizes of one cause by the equation of motion.
 
     :param sizes: estimate and ends of the interval, by full name
-    :param doubts: of that interval, half the width that comes from not knowing whether there is one
-        cause more
+    :param doubts: half the width of the interval that is due to model uncertainty, by full name
     """
 
     sizes: dict[str, tuple[float, float, float]]
@@ -57,7 +56,7 @@ class Screened(NamedTuple):
     :param motion: of the joints
     :param members: of the best set by information criterion
     :param hints: keys of effects that are small beside the unexplained residual
-    :param keys: of the candidates that are worth a simulation
+    :param keys: of the candidates to simulate
     :param nameless_at: joints at which flexible forces are tried
     :param by_velocity: the equation of each joint, averaged over intervals of similar velocity
     """
@@ -72,11 +71,11 @@ class Screened(NamedTuple):
     by_velocity: tuple[ByVelocity, ...]
 
     def among(self, keys: Collection[str]) -> "Screened":
-        """:return: the same with some members, solved and judged anew without the others"""
+        """:return: the same with some of the members, solved again without the others"""
         return self._with_items([m.item for m in self.members if m.key in keys])
 
     def without(self, keys: Collection[str]) -> "Screened":
-        """:return: the same with simpler members of their families instead of some, or none"""
+        """:return: the same with simpler members of their families in place of these, if any"""
         rest = [m.item for m in self.members if m.key not in keys]
         left_out = [m.item for m in self.members if m.key in keys]
         return self._with_items(
@@ -143,7 +142,7 @@ class Screened(NamedTuple):
     def detectable(self) -> dict[str, dict[str, float]]:
         """
         By candidate and short name, the smallest size that would explain a twentieth of what the
-        nominal model leaves, and be worth its price.
+        nominal model leaves, and exceed its price.
         """
         p = self.problem
         start = p.solve(list(p.always))
@@ -153,7 +152,7 @@ class Screened(NamedTuple):
         for i, item in enumerate(p.items):
             if item.key in found or i in p.always:
                 continue
-            needed = max(_TOLD * start.rss, p.price(i) + _SURELY)
+            needed = max(_EXPLAINED * start.rss, p.price(i) + _MARGIN)
             sizes = found.setdefault(item.key, {})
             for column, name in zip(item.columns, item.names, strict=True):
                 size = np.sqrt(needed / seen[column]) if seen[column] > 0.0 else np.inf
@@ -167,7 +166,7 @@ class Screened(NamedTuple):
 
     @property
     def stops_within(self) -> np.ndarray:
-        """In which time the dry friction of the set stops each joint [s]."""
+        """Time in which the dry friction of the set stops each joint [s]."""
         p, dof = self.problem, len(self.motion.speed)
         dry = [m.item for m in self.members if p.family(m.item)[0] == "dry"]
         solution = p.solve([*p.always, *(m.item for m in self.members)])
@@ -179,7 +178,7 @@ class Screened(NamedTuple):
 
     @property
     def scales(self) -> dict[str, float]:
-        """What changes a joint's force by a twentieth, of parameters that have a slope there."""
+        """By full name, the change of a parameter that changes a joint's force by a twentieth."""
         p, found = self.problem, {}
         for item in p.items:
             if item.rule != "linear":
@@ -255,7 +254,7 @@ def _of_one_scale(p: Problem, keys: Collection[str]) -> set[str]:
 
 
 def _singles(p: Problem) -> set[str]:
-    """Keys of what explains most beside nothing, of all and at each joint."""
+    """Keys of the candidates that explain most on their own, of all and at each joint."""
 
     def best(items: Sequence[int], most: int) -> list[str]:
         return list(dict.fromkeys(p.items[i].key for i in p.ranking(p.always, items)))[:most]
@@ -268,7 +267,7 @@ def _singles(p: Problem) -> set[str]:
 
 
 def _without_column(h: Hypotheses, p: Problem, moved: Motion, where: Sequence[str]) -> set[str]:
-    """What equation errors cannot say anything of, unless the kinematics refute it."""
+    """Keys of candidates without a column, unless the kinematics refute them."""
     there = {item.key for item in p.items}
     refuted = refuted_by_kinematics(h.believed, moved)
     found = set()

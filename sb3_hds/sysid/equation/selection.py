@@ -1,4 +1,4 @@
-"""Which causes, all at once: a search over families, judged on data that were held out."""
+"""Subset selection: a local search over sets of causes, confirmed on held-out data."""
 
 from collections.abc import Collection
 
@@ -15,14 +15,14 @@ from sb3_hds.sysid.equation.confirmation import (
 from sb3_hds.sysid.equation.problem import SHARED, Problem
 from sb3_hds.sysid.estimation.candidates import PARAMETER
 
-# Moves that are tried from each set: of what promises most when added, and in the place of another.
+# Moves that are tried from each set: best additions, best substitutes of a member, and rounds.
 _ADDED, _SWAPPED, _MOST_MOVES = 12, 5, 80
-# Members of which so rare ones are doubted, and how many.
+# Rarity from which members are retried without, and how many.
 _DOUBTFUL, _MOST_SHAKEN = 1.5, 4
 _VISCOUS, _DRY = "viscous_friction", "coulomb_friction"
 #: effects that make commands late
 LATE = ("action_delay", "motor_lag")
-# Joints at which the same effect may stand for something that all share.
+# Number of joints from which the same effect may stand for one that all actuators share.
 _MANY_JOINTS = 3
 
 
@@ -43,7 +43,7 @@ def propose(problem: Problem) -> tuple[list[int], list[int]]:
 
 # ------------------------------------------------------------------------------ starts
 def _starts(p: Problem) -> list[list[int]]:
-    """Whole machines: friction at every joint, the same with everything late, and nothing."""
+    """Friction at every joint, the same with delayed commands, and the nuisances alone."""
     friction = _friction_beside(p, list(p.always))
     starts = [friction]
     if p.dof < 3 or not friction:
@@ -65,7 +65,7 @@ def _starts(p: Problem) -> list[list[int]]:
 
 
 def _friction_beside(p: Problem, others: list[int]) -> list[int]:
-    """Viscous and dry friction everywhere; what would drive leaves, the most negative first."""
+    """Viscous and dry friction at all joints, without what would have a negative size."""
     names = (_VISCOUS, _DRY)
     friction = [i for i, item in enumerate(p.items) if item.candidate.name in names]
     keys = friction + others
@@ -113,7 +113,7 @@ def _swap(p: Problem, keys: list[int]) -> list[list[int]]:
 
 
 def _at_all_joints(p: Problem, keys: list[int]) -> list[list[int]]:
-    """The same effect everywhere, added, taken away, or exchanged for one that all share."""
+    """The same effect at all joints added, removed, or replaced by one that all actuators share."""
     if p.dof == 1:
         return []
     trials = []
@@ -144,8 +144,8 @@ def _within_bounds(p: Problem, keys: list[int], new: list[int]) -> list[int]:
 
 def _try_shared(p: Problem, keys: list[int]) -> list[int]:
     """
-    Climb again with what all actuators share, such as a late bus, in the place of something at many
-    joints: that is better only once the others have made room.
+    Climb again with an effect that all actuators share, such as a delay of the bus, in place of the
+    same effect at many joints: no single move can make that exchange.
     """
     score = p.score(keys)
     while True:
@@ -167,8 +167,8 @@ def _try_shared(p: Problem, keys: list[int]) -> list[int]:
 
 def _retry_without_doubtful(p: Problem, keys: list[int]) -> list[int]:
     """
-    Climb again without one member at a time, the least plausible first: what was added early may
-    stand for two others, and no single move tells.
+    Climb again without one member at a time, the least plausible first: a member that was added
+    early may stand for two others, which no single move can show.
     """
     score, tried = p.score(keys), set()
     for _ in range(_MOST_SHAKEN):

@@ -1,4 +1,4 @@
-"""What the nominal model says of measured motion: one step of the twin from every row."""
+"""The nominal model along measured motion: one step of the twin from every row."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -17,9 +17,9 @@ from sb3_hds.effects import ConstantForce
 
 # Rows that are evaluated at a time: programs are compiled for one shape.
 _ROWS = 1024
-# A force that a machine hardly notices, in shares of what is typical at a joint.
+# Size of the probing force, in shares of the typical force at a joint.
 _PUSH = 1e-3
-# An interval's response to a force may be this many times weaker than the mass matrix alone has it.
+# Largest condition number of the response to a force, relative to that of the mass matrix.
 _STIFFEST = 1e6
 
 
@@ -30,7 +30,7 @@ class Terms(NamedTuple):
     :param change: of the velocity over an interval, as the twin steps, shape ``(n, dof)``
     :param mass: mass matrix where the interval begins, shape ``(n, dof, dof)``
     :param actuator: force of the actuators there, shape ``(n, dof)``
-    :param bias: force that gravity and inertia take there, shape ``(n, dof)``
+    :param bias: force of gravity, Coriolis and centrifugal terms there, shape ``(n, dof)``
     """
 
     change: np.ndarray
@@ -80,15 +80,15 @@ def effective_inertia(
     found: Terms,
 ) -> Float[np.ndarray, "n dof dof"]:
     r"""
-    What a constant force meets over an interval,
+    The inertia that a constant force acts on over an interval,
 
     .. math:: h \left(\frac{\partial\,\Delta v}{\partial f}\right)^{-1}
 
-    The mass matrix, and what damping adds within the interval: where a stiff servo brakes what a
-    force sets in motion, several times as much.
+    It is the mass matrix plus the effect of damping within the interval: several times as much
+    where a stiff servo brakes the motion.
 
     :param found: :func:`terms` of the same rows
-    :return: the mass matrix where the twin's step does not answer to forces
+    :return: the mass matrix where the twin's step does not respond to forces
     """
     plant = plant_of(twin)
     if not isinstance(plant, AnalyticTwin):
@@ -110,7 +110,7 @@ def effective_inertia(
 
 
 def portions(n: int) -> Iterator[tuple[np.ndarray, int]]:
-    """:return: rows, always as many at a time, the last one repeated; and how many of them count"""
+    """:return: indices in portions of equal size, the last one padded, and how many are real"""
     for first in range(0, n, _ROWS):
         yield np.minimum(np.arange(first, first + _ROWS), n - 1), min(_ROWS, n - first)
 

@@ -1,9 +1,10 @@
 """
-The equation against test functions: noise of velocities averages out, accelerations are not formed.
+Weak form of the equation of motion: noise of velocities averages out, and no accelerations are
+formed.
 
-The missing force is an impulse for each interval, and the measured velocities in it telescope where
-the mass matrix is constant: multiplied by a smooth bump and summed, only slopes of the bump meet
-their noise. Overlapping bumps are the rows; Huber weights and blocks of data follow.
+The residual force is an impulse for each interval, and the measured velocities in it telescope
+where the mass matrix is constant: multiplied by a smooth bump and summed, only the slopes of the
+bump multiply their noise. Overlapping bumps give the rows, with Huber weights and blocks of data.
 """
 
 import itertools
@@ -18,30 +19,30 @@ from sb3_hds.sysid.equation.regression import TINY, Equation, Item
 
 # Width of a bump, in periods of the joint's motion, and its least number of intervals.
 _WIDTH, _LEAST = 0.3, 6
-# How often it is halved where there would be too few rows.
+# Number of widths, each half the one before, that are tried where there would be too few rows.
 _NARROWEST = 5
-# Below this share of the root mean square speed, or so many of its errors, a joint is at rest: dry
-# friction is then whatever it has to be, and says nothing. Intervals around a reversal, which
-# smoothing blurs, likewise.
+# Below this share of the root mean square speed, or this many of its errors, a joint is at rest:
+# static friction then takes any value, and such intervals carry no information, nor do those around
+# a reversal, which smoothing blurs.
 _REST, _ERRORS = 0.02, 3.0
 # Where a velocity is below this multiple of what it changes by in an interval, the joint may have
 # stopped in between.
 _STOPS = 1.0
-# Rows per column of the rich model that should be left, and what has to do where a joint rests for
-# this share of the time. Where even that is too much, more stays in (around reversals, then where a
-# joint may have stopped, rest at last) or bumps become shorter than the least.
+# Rows per column of the rich model that should remain, the fallbacks where a joint rests for this
+# share of the time, and half widths shorter than the least. With too few rows, more intervals are
+# kept: around reversals, then where a joint may have stopped, and rest at last.
 _ENOUGH, _OFTEN, _SHORTEST = (4.0, 2.0, 1.0), 0.1, (2, 1)
-# Wider bumps average the noise of the velocities, and cost rows around reversals: so they are wide
-# where this share of what is left is such noise, and narrower by more than the factor only where
-# there is next to none.
+# Wider bumps average the noise of velocities, and cost rows around reversals: bumps are wide where
+# this share of the residual is such noise, and narrower by more than this factor only where there
+# is hardly any.
 _AVERAGED, _NARROW, _NO_NOISE = 0.5, 3.0, 0.05
-# Huber's threshold, in units of the noise, and how often weights are found anew.
+# Huber's threshold, in units of the noise, and number of reweightings.
 _HUBER, _PASSES = 2.0, 4
-# Blocks of data that agree or not: recordings, or pieces of them where they are fewer.
+# Clusters: at least this many recordings, or pieces of them; and folds of held-out data.
 _BLOCKS, _FOLDS = 16, 8
-# How much wider cluster-robust errors may be than naive ones.
+# Largest ratio of cluster-robust to naive variances.
 _MOST_DEFLATION = 10.0
-# What the rich model of the noise leaves out: with it, nothing equals nothing.
+# Effects that the rich model of the noise leaves out: with them, it would fit trivially, 0 = 0.
 _SCALES = ("torque_gain", "directional_gain", "dead_zone", "saturation", "sensor_scale")
 _RANK = 1e-6
 
@@ -72,12 +73,12 @@ class Rows(NamedTuple):
 
 def rich_columns(items: list[Item], used: np.ndarray) -> np.ndarray:
     """
-    :return: places among ``used`` of the columns of a rich linear model, what it leaves being noise
+    :return: places among ``used`` of the columns of a rich linear model, whose residual is noise
     """
     wanted: dict[str, tuple[int, ...]] = {}
     for item in items:
         if item.rule in ("linear", "blend") and item.candidate.name not in _SCALES:
-            # Of what has several settings, the one in the middle stands for all.
+            # The first of several settings stands for all.
             wanted.setdefault(item.key, item.columns)
     columns = {c for cs in wanted.values() for c in cs}
     return np.flatnonzero(np.isin(used, list(columns)))
@@ -134,8 +135,8 @@ def _choices(
     equation: Equation, j: int, halves: list[int]
 ) -> Iterator[tuple[np.ndarray, list[int], float]]:
     """
-    :return: intervals to leave out, half widths of bumps, and rows per column that must be left:
-        what is taken first, and what where that leaves too few rows
+    :return: intervals to leave out, half widths of bumps, and rows per column that must remain, in
+        order of preference
     """
     v, motion = equation.v[:, j], equation.motion
     slow = np.abs(v) < max(_ERRORS * motion.error_v[j], _REST * motion.speed[j])
@@ -163,7 +164,7 @@ def _bump(half: int) -> np.ndarray:
 def _against_bumps(
     table: np.ndarray, recording: np.ndarray, left_out: np.ndarray, half: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """:return: sums against bumps a half width apart, and the middle of each"""
+    """:return: sums against bumps at distances of a half width, and the middle of each"""
     phi = _bump(half)
     rows, middles = [np.zeros((0, table.shape[1]))], [np.zeros(0, int)]
     for first in _begins(recording, left_out, half):
@@ -242,7 +243,7 @@ def grams(equation: Equation) -> Grams:
     """
     Normal equations of :func:`weak_rows`.
 
-    Blocks that agree less than their rows would: then each row counts as less than one, by the
+    Where blocks disagree more than independent rows would, each row counts as less than one, by the
     ratio of cluster-robust to naive variances of the rich model's coefficients.
     """
     n_columns, dof = len(equation.columns), equation.missing.shape[1]
