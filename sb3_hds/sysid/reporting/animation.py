@@ -1,4 +1,4 @@
-"""A machine that moves: as measured, and as predicted by the nominal and by the extended model."""
+"""Animation of a machine: as measured, and as predicted by the nominal and the extended model."""
 
 import json
 from collections.abc import Callable
@@ -36,23 +36,23 @@ PLAYERS = (
     Player("predicted by the model as it came", "#d1495b", 1.0, 0.8),
     Player("predicted by the corrected model", "#27496d", 0.6, 0.9),
 )
-# Frames that a page holds at most, and joints whose errors it shows.
+# Most frames of a page, and most joints whose errors it shows.
 _MOST_FRAMES, _MOST_JOINTS = 400, 12
-# From where a mechanism is seen: turned about its vertical, then tipped towards the eye [rad].
+# Direction of view of a mechanism: azimuth and elevation [rad].
 _AZIMUTH, _ELEVATION = 0.9, 0.35
-# Corners of what a mesh looks like.
+# Corners of the outline of a mesh.
 _CORNERS = 20
-# Size of the drawing in units of its own.
+# Size of the drawing in its units.
 _SIZE = 100.0
 
 
 class Animation(NamedTuple):
     """
-    :param time: since the stretch begins [s], shape ``(frames,)``
-    :param lines: of each player, both ends of each capsule as they are seen, in the drawing's
-        units, shape ``(3, frames, capsules, 2, 2)``; not a number where a simulation is not finite
-    :param outlines: corners of what its model's meshes look like, in a circle, likewise, shape
-        ``(3, frames, shapes, corners, 2)``
+    :param time: since the first frame [s], shape ``(frames,)``
+    :param lines: of each player, both ends of each capsule as projected, in the drawing's units,
+        shape ``(3, frames, capsules, 2, 2)``; NaN where a simulation is not finite
+    :param outlines: corners of the projected meshes, counter-clockwise, in the drawing's units,
+        shape ``(3, frames, shapes, corners, 2)``
     :param names: of the joints, with their units
     :param errors: predicted minus measured position of each joint, before and after, shape ``(2,
         frames, joints)``
@@ -68,7 +68,7 @@ class Animation(NamedTuple):
 
     @property
     def still(self) -> int:
-        """The frame that says most: where the two predictions are farthest apart."""
+        """The frame in which the two predictions differ most."""
         gap = np.abs(self.lines[1] - self.lines[2]).reshape(len(self.time), -1)
         return int(np.argmax(np.nan_to_num(gap).max(1)))
 
@@ -97,7 +97,7 @@ class Animation(NamedTuple):
         }
 
     def _to_json(self) -> str:
-        """All frames, rounded to what can be seen."""
+        """All frames, rounded to visible precision."""
         plain = {
             "time": _numbers(self.time, 3),
             "lines": [[_numbers(frame, 1) for frame in player] for player in self.lines],
@@ -125,8 +125,8 @@ def _chart(label: str, errors: np.ndarray, share: np.ndarray) -> dict[str, Any]:
 
 def animate(believed: Twin, extended: Twin, replay: Replay) -> Animation:
     """
-    :param believed: nominal model, which reads positions from observations
-    :param extended: the corrected one
+    :param believed: nominal model
+    :param extended: corrected model
     :param replay: held-out stretches
     """
     rows = np.flatnonzero(np.isfinite(replay.time))
@@ -177,7 +177,7 @@ def _poses(
 
 
 def _projected(ends: np.ndarray) -> np.ndarray:
-    """Parallel, from in front, to the right and above."""
+    """Parallel projection, seen from the front, the right and above."""
     c, s = np.cos(_AZIMUTH), np.sin(_AZIMUTH)
     right, away = c * ends[..., 0] + s * ends[..., 1], -s * ends[..., 0] + c * ends[..., 1]
     up = np.cos(_ELEVATION) * ends[..., 2] + np.sin(_ELEVATION) * away
@@ -186,8 +186,8 @@ def _projected(ends: np.ndarray) -> np.ndarray:
 
 def _outlines(corners: np.ndarray) -> np.ndarray:
     """
-    :param corners: of convex bodies, as they are seen, shape ``(..., corners, 2)``
-    :return: the farthest of them in each of some directions, in a circle
+    :param corners: of convex bodies as projected, shape ``(..., corners, 2)``
+    :return: the farthest of them in each of ``_CORNERS`` directions
     """
     if not corners.size:
         return np.zeros((*corners.shape[:-2], 0, 2))
@@ -200,7 +200,7 @@ def _outlines(corners: np.ndarray) -> np.ndarray:
 def _frame_of(measured: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """
     :param measured: points, shape ``(n, 2)``
-    :return: what puts points in the drawing's units, y downwards, and these in the middle of it
+    :return: maps points to the drawing's units, y downwards, with these points in its centre
     """
     real = measured[np.isfinite(measured).all(1)]
     low, high = real.min(0), real.max(0)

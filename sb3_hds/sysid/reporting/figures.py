@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 _MEASURED, _BEFORE, _AFTER, _ALIKE, _QUIET = "#3b3a36", "#d1495b", "#27496d", "#8fabc9", "#9a978c"
 # One for each answer that the data leave open.
 _OF_ANSWERS = (_AFTER, _BEFORE, "#8a6d1d", "#2e7d6b", "#7a4f9a", _QUIET)
-# Widths on a desk or on paper, and on a telephone [in]: letters keep their size.
+# Widths for a desktop or paper, and for a phone [in]; the font size is the same.
 _WIDE, _NARROW = 9.0, 4.4
 _DPI = 150
-# A candidate that makes predictions worse than this is drawn as if it did so by this much.
+# Gains below this are drawn as this.
 _WORST = -0.05
-# How far a panel reaches beyond what was measured, in shares of its range, where the nominal model
-# runs away; and from which ratio on errors are drawn on a logarithmic scale.
+# Margin of a panel around the measurements where the nominal model diverges, in shares of their
+# range; ratio of errors from which they are drawn on a logarithmic scale.
 _AROUND, _DECADE = 0.5, 10.0
-# Letters of a line of a label.
+# Characters per line of a label.
 _LINE = 16
 
 
@@ -48,7 +48,7 @@ def plot_fit(fit: "Fit", path: Any) -> None:
 
 
 def plot_rollouts(p: "Pictures", narrow: bool = False) -> Any:
-    """Each channel, and beside it what the simulations miss."""
+    """Each channel as measured and simulated, and beside it the errors of the simulations."""
     figure, panels = _figure(len(p.channels), 2, 1.6, narrow)
     seen = p.replay
     for j, (name, unit) in enumerate(p.channels):
@@ -79,7 +79,7 @@ def plot_rollouts(p: "Pictures", narrow: bool = False) -> Any:
 
 
 def plot_horizons(d: Any, p: "Pictures", narrow: bool = False) -> Any:
-    """Error against the number of steps that are predicted."""
+    """Prediction error against the horizon."""
     figure, panels = _figure(1, 1, 2.6, narrow)
     axes = panels[0, 0]
     for errors, colour, label in zip(p.errors, (_BEFORE, _AFTER), ("before", "after"), strict=True):
@@ -99,7 +99,7 @@ def plot_horizons(d: Any, p: "Pictures", narrow: bool = False) -> Any:
 
 
 def plot_missing_force(p: "Pictures", narrow: bool = False) -> Any:
-    """The force that is missing against position, velocity, command and time, joint by joint."""
+    """The residual force of each joint against position, velocity, command and time."""
     columns = 4 if p.actuators else 3
     figure, panels = _figure(len(p.joints), columns, 2.2, narrow)
     explained = p.missing.force - p.left.force
@@ -213,7 +213,7 @@ def plot_policy_gain(gain: Mapping[str, Any], narrow: bool = False) -> Any:
 
 def plot_belief(belief: BeliefTwin, path: str | os.PathLike[str]) -> None:
     """
-    Draw what differs between draws: of each parameter the draws, by answer, and the best guess.
+    Draw each uncertain parameter: its draws, by answer, and the value of the likeliest answer.
 
     :param path: of the picture, for example ``"belief.png"``
     """
@@ -283,7 +283,7 @@ def _empty_figure(size: tuple[float, float]) -> Any:
 
 
 def _cut(axes: Any, shown: np.ndarray, around: float) -> None:
-    """End a panel not far beyond what has to be seen in it."""
+    """Limit a panel to the data shown, with a margin."""
     shown = shown[np.isfinite(shown)]
     ends, whole = (shown.min() - around, shown.max() + around), axes.get_ylim()
     if around > 0.0:
@@ -291,7 +291,7 @@ def _cut(axes: Any, shown: np.ndarray, around: float) -> None:
 
 
 def _label(name: str, unit: str) -> str:
-    """Broken between words where it is long."""
+    """Name and unit, with line breaks between words."""
     lines = [""]
     for word in name.replace("_", "_ ").split():
         if lines[-1] and len(lines[-1] + word) > _LINE:
@@ -304,8 +304,8 @@ def _label(name: str, unit: str) -> str:
 def _figure(rows: int, columns: int, height: float, narrow: bool) -> tuple[Any, np.ndarray]:
     """
     :param height: of a row [in]
-    :param narrow: whether the panels of a row stand two in a row, or one
-    :return: figure, and its panels in ``rows`` and ``columns`` wherever they stand
+    :param narrow: whether to place the panels of a row two abreast, or one below the other
+    :return: figure, and its panels in ``rows`` and ``columns``, wherever they are placed
     """
     beside = columns if not narrow else 2 if columns == 4 else 1
     deep = rows * columns // beside

@@ -1,4 +1,4 @@
-"""A diagnosis as one page that needs no network."""
+"""A diagnosis as one self-contained HTML page."""
 
 import base64
 import os
@@ -34,7 +34,7 @@ def check_installed() -> None:
 
 def check_page(path: str | os.PathLike[str]) -> None:
     """
-    :raises ParameterError: for a name that is none of a page
+    :raises ParameterError: for a file name that does not end in ``.html``
     :raises OSError: if there is no folder to write it in
     """
     if Path(path).suffix.lower() not in (".html", ".htm"):
@@ -47,7 +47,7 @@ def check_page(path: str | os.PathLike[str]) -> None:
 
 class _Picture(NamedTuple):
     """
-    :param draw: called with whether the picture is for a narrow page
+    :param draw: returns the figure, for a narrow page or a wide one
     :param rows: of a table below it
     :param shown: whether there is anything to draw
     """
@@ -66,11 +66,11 @@ def write_report(
     experiment: NextExperiment | None = None,
 ) -> Path:
     """
-    :param path: of the page; a file of that name is replaced as a whole
+    :param path: of the page; an existing file is replaced
     :param policy_gain: as plain data
     :param experiment: what to record next
     :raises ImportError: without matplotlib and jinja2
-    :raises ParameterError: for a name that is none of a page
+    :raises ParameterError: for a file name that does not end in ``.html``
     :raises OSError: if there is no folder to write it in
     """
     check_page(path)
@@ -95,7 +95,7 @@ def template(name: str) -> Any:
 
 def write_pictures(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[Path]:
     """
-    :param folder: is made where it is missing; files of the same names are replaced
+    :param folder: is created if it does not exist; existing files are replaced
     :return: one PNG for each picture of the report
     :raises ImportError: without matplotlib and jinja2
     """
