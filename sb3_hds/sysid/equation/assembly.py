@@ -17,7 +17,7 @@ from sb3_hds.sysid.equation.effect_columns import (
 )
 from sb3_hds.sysid.equation.plausibility import plausibility, rarity_of
 from sb3_hds.sysid.equation.problem import Problem
-from sb3_hds.sysid.equation.regression import STEP, Equation, Item, Rows, put
+from sb3_hds.sysid.equation.regression import STEP, Equation, Item, Rows, put, residual_force
 from sb3_hds.sysid.equation.selection import LATE
 from sb3_hds.sysid.equation.terms import effective_inertia, terms
 from sb3_hds.sysid.equation.weak_form import grams
@@ -45,48 +45,39 @@ def equation(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equ
         matrix as effective inertia
     """
     twin, rows = hypotheses.believed, _rows(motion)
-    params = twin.params
-    found = terms(twin, params, rows.q, rows.v, rows.actions)
-    given = (rows.q, rows.v, rows.actions)
-    effective = found.mass if quick else effective_inertia(twin, params, *given, found)
-    force = lambda change: (  # noqa: E731
-        np.einsum("nij,nj->ni", effective, change - found.change) / motion.dt
-    )
-    missing, smooth = force(rows.measured), force(rows.change)
-    load = np.einsum("nij,nj->ni", found.mass, rows.a) + found.bias
+    given = (twin, twin.params, rows.q, rows.v, rows.actions)
+    found = terms(*given)
+    effective = found.mass if quick else effective_inertia(*given, found)
     made = Equation(
+        twin=twin,
         motion=motion,
-        missing=missing,
-        recording=rows.recording,
-        q=rows.q,
-        v=rows.v,
-        load=load,
-        actuator=found.actuator,
-        mass=found.mass,
+        rows=rows,
+        terms=found,
         effective=effective,
+        load=np.einsum("nij,nj->ni", found.mass, rows.a) + found.bias,
+        missing=residual_force(effective, rows.measured - found.change, motion.dt),
+        smooth=residual_force(effective, rows.change - found.change, motion.dt),
     )
-    typical = np.sqrt(np.mean(np.concatenate([load, found.actuator]) ** 2)) + 1e-300
     refuted = set() if quick else refuted_by_kinematics(twin, motion)
     inertia = 1.0 / np.diagonal(np.linalg.inv(found.mass), axis1=1, axis2=2)
-    nodes = [nodes_of(made, rows, found.bias, inertia, j) for j in range(inertia.shape[1])]
+    nodes = [nodes_of(made, inertia, j) for j in range(inertia.shape[1])]
     for candidate in hypotheses.candidates:
         effect = hypotheses.effect_of(candidate)
         if candidate.key in refuted:
             continue
         if candidate.slot == PARAMETER:
-            _add_parameter(made, hypotheses, candidate, rows, smooth, typical)
+            _add_parameter(made, candidate)
         elif quick and candidate.name in CLOSED_FORMS:
             add_closed_form(made, candidate, nodes[candidate.index])
         elif isinstance(effect, JointEffect) and not jax.tree.leaves(effect.memory(twin)):
-            add_force(made, candidate, effect, nodes[candidate.index], rows)
+            add_force(made, candidate, effect, nodes[candidate.index])
         elif isinstance(effect, ActionEffect) and candidate.index >= 0:
-            add_command(made, hypotheses, candidate, effect, rows)
+            add_command(made, candidate, effect)
         elif isinstance(effect, SensorEffect):
-            add_sensor(made, hypotheses, candidate, effect, rows, smooth)
-    add_common(made, hypotheses)
+            add_sensor(made, candidate, effect)
+    add_common(made, hypotheses.candidates)
     for name in (hypotheses.names[i] for i in hypotheses.nuisances):
-        own = Candidate(f"parameter.{name}", PARAMETER, name, -1, (name,), "")
-        _add_parameter(made, hypotheses, own, rows, smooth, typical)
+        _add_parameter(made, Candidate(f"parameter.{name}", PARAMETER, name, -1, (name,), ""))
     return made
 
 
@@ -124,47 +115,37 @@ def _rows(motion: Motion) -> Rows:
     return Rows(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-# ------------------------------------------------------------------------------ the twin's own
-def _add_parameter(
-    made: Equation,
-    hypotheses: Hypotheses,
-    candidate: Candidate,
-    rows: Rows,
-    smooth: np.ndarray,
-    typical: float,
-) -> None:
+def _add_parameter(made: Equation, candidate: Candidate) -> None:
     """Minus the derivative of the residual force, by a finite difference."""
-    twin, (name,) = hypotheses.believed, candidate.parameters
+    twin, rows, now, (name,) = made.twin, made.rows, made.terms, candidate.parameters
     parameter, value = twin.parameters[name], twin.values[name]
     step = STEP * parameter.scale
     step = -step if value + step > parameter.upper else step
     there = terms(twin, {**twin.params, name: value + step}, rows.q, rows.v, rows.actions)
-    effective = made.effective + there.mass - made.mass
+    effective = made.effective + there.mass - now.mass
 
     def column_of(change: np.ndarray, before: np.ndarray) -> np.ndarray:
-        moved = np.einsum("nij,nj->ni", effective, change - there.change) / made.motion.dt
-        return -(moved - before) / step
+        after = residual_force(effective, change - there.change, made.motion.dt)
+        return -(after - before) / step
 
-    column = column_of(rows.change, smooth)
-    if (
-        not np.isfinite(column).all()
-        or np.sqrt(np.mean(column**2)) * parameter.scale < _NOTHING * typical
-    ):
+    column = column_of(rows.change, made.smooth)
+    typical = np.sqrt(np.mean(np.concatenate([made.load, now.actuator]) ** 2)) + 1e-300
+    size = np.sqrt(np.mean(column**2)) * parameter.scale
+    if not np.isfinite(column).all() or size < _NOTHING * typical:
         return
     index = put(made, None, column)
     made.items.append(Item(candidate, (index,), (name,)))
-    slope = (there.mass - made.mass) / step
+    slope = (there.mass - now.mass) / step
     if np.abs(slope).max() > 0.0:
         made.slopes[candidate.key] = slope
         made.noisy[index] = put(made, None, column_of(rows.measured, made.missing))
-    drive = np.sum((there.actuator - made.actuator) * made.actuator, axis=0) / step
-    power = np.sum(made.actuator**2, axis=0)
+    drive = np.sum((there.actuator - now.actuator) * now.actuator, axis=0) / step
+    power = np.sum(now.actuator**2, axis=0)
     drive = np.divide(drive, power, out=np.zeros_like(drive), where=power > 0.0)
     if np.abs(drive).max() > 0.0:
         made.drives[candidate.key] = drive
 
 
-# ------------------------------------------------------------------------------ the problem
 def problem(hypotheses: Hypotheses, equation: Equation) -> Problem:
     """:return: its normal equations, with bounds, prices and prior odds of all items"""
     items, n = tuple(equation.items), len(equation.columns)
@@ -186,9 +167,9 @@ def problem(hypotheses: Hypotheses, equation: Equation) -> Problem:
     for c, column in enumerate(equation.columns):
         own = slice(None) if column.joint is None else column.joint
         shares[own, c] = np.sqrt(np.mean(column.values**2, axis=0))
-    force = np.sqrt(np.mean(equation.actuator**2, axis=0))
+    force = np.sqrt(np.mean(equation.terms.actuator**2, axis=0))
     force = np.maximum(force, np.sqrt(np.mean(equation.load**2, axis=0))) + 1e-300
-    some = np.linspace(0, len(equation.mass) - 1, min(32, len(equation.mass))).astype(int)
+    some = np.linspace(0, len(equation.effective) - 1, min(32, len(equation.effective))).astype(int)
     return Problem(
         items=items,
         grams=grams(equation),
@@ -198,7 +179,7 @@ def problem(hypotheses: Hypotheses, equation: Equation) -> Problem:
         force=force,
         shares=shares,
         passes=_passing(hypotheses, equation, items),
-        mass=equation.mass[some],
+        mass=equation.terms.mass[some],
         effective=equation.effective[some],
         noise=np.maximum(equation.motion.noise_v, _QUIETEST * equation.motion.speed.max()),
         noisy=equation.noisy,
@@ -217,7 +198,7 @@ def _rests(equation: Equation, items: Sequence[Item]) -> dict[int, tuple[float, 
     for number, item in enumerate(items):
         if item.candidate.name != "stiffness" or item.rule != "blend":
             continue
-        q = equation.q[:, item.candidate.index]
+        q = equation.rows.q[:, item.candidate.index]
         beyond = _BEYOND * float(np.ptp(q))
         first, second = (at["q0"] for at in item.settings)
         ends = (float(q.min()) - beyond, float(q.max()) + beyond)

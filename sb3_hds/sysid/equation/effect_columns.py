@@ -16,10 +16,17 @@ from sb3_hds.core import ActionEffect, JointEffect, JointMoment, SensorEffect, S
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.effects import SensorDelay
 from sb3_hds.effects.joint import DryFriction
-from sb3_hds.sysid.equation.regression import STEP, Equation, Item, Rows, put, put_acting, ranges_of
+from sb3_hds.sysid.equation.regression import (
+    STEP,
+    Equation,
+    Item,
+    put,
+    put_acting,
+    ranges_of,
+    residual_force,
+)
 from sb3_hds.sysid.equation.terms import forces, memory_of, portions, terms
 from sb3_hds.sysid.estimation.candidates import Candidate
-from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.motion.joints import encoders
 
 # Nodes for a normal distribution, in standard deviations, and their weights (Gauss-Hermite).
@@ -43,11 +50,10 @@ def add_force(
     candidate: Candidate,
     effect: JointEffect,
     nodes: Mapping[str, np.ndarray],
-    rows: Rows,
 ) -> None:
     """Columns of a force at a joint: its derivatives by its parameters, at fixed settings."""
     j, motion = candidate.index, made.motion
-    settings = effect.grid(ranges_of(made, rows, j, None))
+    settings = effect.grid(ranges_of(made, j, None))
     names = tuple(effect.parameters)
     nulls = {name: p.null for name, p in effect.parameters.items()}
     given = settings or ({},)
@@ -78,16 +84,14 @@ def add_closed_form(made: Equation, candidate: Candidate, nodes: Mapping[str, np
     made.items.append(Item(candidate, (column,), (name,)))
 
 
-def nodes_of(
-    made: Equation, rows: Rows, bias: np.ndarray, inertia: np.ndarray, joint: int
-) -> dict[str, np.ndarray]:
+def nodes_of(made: Equation, inertia: np.ndarray, joint: int) -> dict[str, np.ndarray]:
     """
     Quadrature nodes of each interval, over the part that the twin's integrator evaluates: two
     points (Gauss-Legendre) before and after the velocity changes its sign, so that the mean of dry
     friction is exact; each at three velocities (Gauss-Hermite), for the uncertainty of that
     instant. Where the model brakes the motion, a force counts more the later it acts.
     """
-    motion, dt = made.motion, made.motion.dt
+    motion, rows, dt = made.motion, made.rows, made.motion.dt
     ends = rows.q, rows.v, rows.next_q, rows.next_v
     q, v, next_q, next_v = (x[:, joint, None, None] for x in ends)
     first = v + motion.error_v[joint] * _PLACES
@@ -97,7 +101,7 @@ def nodes_of(
     half = _GAUSS[:, None]
     inside = np.concatenate([before * half, before + (1.0 - before) * half], axis=1)
     shares = np.concatenate([before, before, 1.0 - before, 1.0 - before], axis=1)
-    shares = shares * impulse_weights(made.mass, made.effective, joint, inside)
+    shares = shares * impulse_weights(made.terms.mass, made.effective, joint, inside)
     s = motion.seen * inside
     # A cubic through both ends, of velocities a line.
     position = (2 * s**3 - 3 * s**2 + 1) * q + dt * (s**3 - 2 * s**2 + s) * v
@@ -107,7 +111,7 @@ def nodes_of(
         "v": first + change * inside,
         "weights": 0.5 * shares * _WEIGHTS,
         "actuator": made.load[:, joint],
-        "load": bias[:, joint],
+        "load": made.terms.bias[:, joint],
         "inertia": inertia[:, joint],
     }
 
@@ -181,18 +185,12 @@ def _slopes_of(
 
 
 # ------------------------------------------------------------------------------ commands
-def add_command(
-    made: Equation,
-    hypotheses: Hypotheses,
-    candidate: Candidate,
-    effect: ActionEffect,
-    rows: Rows,
-) -> None:
+def add_command(made: Equation, candidate: Candidate, effect: ActionEffect) -> None:
     """Columns of delayed or distorted commands: changes of the actuators' force."""
-    twin, i, dt = hypotheses.believed, candidate.index, made.motion.dt
+    twin, rows, i = made.twin, made.rows, candidate.index
     if not rows.actions.size or not np.ptp(rows.actions[:, i]) > 0.0:
         return
-    settings, names = effect.grid(ranges_of(made, rows, None, i)), tuple(effect.parameters)
+    settings, names = effect.grid(ranges_of(made, None, i)), tuple(effect.parameters)
     nulls = {name: p.null for name, p in effect.parameters.items()}
     if effect.chained and len(settings) < 2:
         return
@@ -201,7 +199,7 @@ def add_command(
         given = [{**nulls, name: nulls[name] + s} for name, s in zip(names, steps, strict=True)]
     else:
         given = [{**nulls, **at} for at in settings]
-    commands = _commanded(effect, given, rows, i, twin, dt)
+    commands = _commanded(made, effect, given, i)
     before = forces(twin, twin.params, rows.q, rows.v, rows.actions[None])[0]
     after = forces(twin, twin.params, rows.q, rows.v, commands)
     changes = after - before
@@ -221,9 +219,9 @@ def add_command(
         made.items.append(Item(candidate, (whole, part), own, "chain", settings[k : k + 2]))
 
 
-def add_common(made: Equation, hypotheses: Hypotheses) -> None:
+def add_common(made: Equation, candidates: Sequence[Candidate]) -> None:
     """Effects that all actuators share, such as a bus delay: sums of the columns of each one."""
-    for candidate in (c for c in hypotheses.candidates if c.slot == "actuator" and c.index < 0):
+    for candidate in (c for c in candidates if c.slot == "actuator" and c.index < 0):
         own = [item for item in made.items if item.candidate.name == candidate.name]
         by_settings: dict[str, list[Item]] = {}
         for item in own:
@@ -243,14 +241,10 @@ def add_common(made: Equation, hypotheses: Hypotheses) -> None:
 
 
 def _commanded(
-    effect: ActionEffect,
-    settings: Sequence[Mapping[str, float]],
-    rows: Rows,
-    index: int,
-    twin: Twin,
-    dt: float,
+    made: Equation, effect: ActionEffect, settings: Sequence[Mapping[str, float]], index: int
 ) -> np.ndarray:
     """:return: commands as they arrive under each setting, shape ``(settings, n, n_act)``"""
+    twin, rows, dt = made.twin, made.rows, made.motion.dt
     found = np.repeat(rows.actions[None], len(settings), 0).astype(float)
     names = tuple(effect.parameters)
     values = np.array([[at[name] for name in names] for at in settings])
@@ -285,16 +279,9 @@ def _arrived(effect: ActionEffect, values: Array, commands: Array, memory: Any, 
 
 
 # ------------------------------------------------------------------------------ sensors
-def add_sensor(
-    made: Equation,
-    hypotheses: Hypotheses,
-    candidate: Candidate,
-    effect: SensorEffect,
-    rows: Rows,
-    smooth: np.ndarray,
-) -> None:
+def add_sensor(made: Equation, candidate: Candidate, effect: SensorEffect) -> None:
     """Minus the change of the residual force if the channel is corrected for the effect."""
-    twin, channels = hypotheses.believed, (candidate.index,)
+    twin, rows, channels = made.twin, made.rows, (candidate.index,)
     if candidate.slot == "joint":
         channels = encoders(twin)[candidate.index].channels
     if isinstance(effect, SensorDelay):
@@ -315,9 +302,9 @@ def add_sensor(
     q, v = read(rows.q, rows.v)
     _, next_v = read(rows.next_q, rows.next_v)
     there = terms(twin, twin.params, q, v, rows.actions)
-    effective = made.effective + there.mass - made.mass
-    moved = np.einsum("nij,nj->ni", effective, next_v - v - there.change) / made.motion.dt
-    column = -(moved - smooth) / step
+    effective = made.effective + there.mass - made.terms.mass
+    after = residual_force(effective, next_v - v - there.change, made.motion.dt)
+    column = -(after - made.smooth) / step
     if np.isfinite(column).all() and np.abs(column).max() > 0.0:
         index = put(made, None, column)
         made.items.append(Item(candidate, (index,), (name,)))

@@ -226,13 +226,13 @@ class FrictionCurve(NamedTuple):
 def by_velocity(equation: Equation, j: int) -> ByVelocity:
     """:return: the equation of one joint, averaged"""
     acting = {i: values for i, c in enumerate(equation.columns) if (values := c.at(j)) is not None}
-    order = np.argsort(equation.v[:, j], kind="stable")
+    order = np.argsort(equation.rows.v[:, j], kind="stable")
     n = max(min(_GROUPS, len(order) // _LEAST), 1)
     begins = np.arange(n) * len(order) // n
     sizes = np.diff(begins, append=len(order))
     mean = lambda values: np.add.reduceat(values[order], begins) / sizes  # noqa: E731
     forces = [mean(values) for values in (*acting.values(), equation.missing[:, j])]
-    return ByVelocity(mean(equation.v[:, j]), np.stack(forces, 1), np.array([*acting], int))
+    return ByVelocity(mean(equation.rows.v[:, j]), np.stack(forces, 1), np.array([*acting], int))
 
 
 def friction_curves(

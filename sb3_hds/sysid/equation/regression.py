@@ -6,7 +6,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sb3_hds.core import Effect, Ranges
+from sb3_hds.core import Effect, Ranges, Twin
+from sb3_hds.sysid.equation.terms import Terms
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.motion.motion import Motion
 
@@ -83,46 +84,6 @@ class Column(NamedTuple):
         return self.values if self.joint == joint else None
 
 
-@dataclasses.dataclass
-class Equation:
-    """
-    The equation of motion along all recordings, one row for each interval.
-
-    :param motion: from which it was made
-    :param missing: residual force of the nominal model, shape ``(n, dof)`` [N m] or [N]
-    :param recording: that each row is from, shape ``(n,)``
-    :param q: smoothed positions where an interval begins, shape ``(n, dof)``
-    :param v: smoothed velocities there
-    :param load: force that the nominal model transmits: inertia, gravity, shape ``(n, dof)``
-    :param actuator: force of the actuators, shape ``(n, dof)``
-    :param mass: mass matrix, shape ``(n, dof, dof)``
-    :param effective: effective inertia over an interval, force over change of velocity with
-        damping, shape ``(n, dof, dof)``
-    :param columns: what candidates would add
-    :param items: candidates, several with different settings
-    :param noisy: of columns that contain the acceleration, smoothed, the index of the same column
-        with the measured one
-    :param slopes: of the mass matrix by inertial parameters, by key of the candidate
-    :param drives: relative change of the actuators' force with a unit of a parameter at each joint,
-        by key of the candidate
-    """
-
-    motion: Motion
-    missing: np.ndarray
-    recording: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    load: np.ndarray
-    actuator: np.ndarray
-    mass: np.ndarray
-    effective: np.ndarray
-    columns: list[Column] = dataclasses.field(default_factory=list)
-    items: list[Item] = dataclasses.field(default_factory=list)
-    noisy: dict[int, int] = dataclasses.field(default_factory=dict)
-    slopes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    drives: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
-
-
 class Rows(NamedTuple):
     """All recordings, one after the other: where intervals begin and end."""
 
@@ -135,6 +96,49 @@ class Rows(NamedTuple):
     recording: np.ndarray
     next_q: np.ndarray
     next_v: np.ndarray
+
+
+@dataclasses.dataclass
+class Equation:
+    """
+    The equation of motion along all recordings, one row for each interval.
+
+    :param twin: nominal model, at the interval of the motion
+    :param motion: from which it was made
+    :param rows: of the motion
+    :param terms: of the nominal model in these rows
+    :param effective: effective inertia over an interval, force over change of velocity with
+        damping, shape ``(n, dof, dof)``
+    :param load: force that the nominal model transmits: inertia, gravity, shape ``(n, dof)``
+    :param missing: residual force of the nominal model, shape ``(n, dof)`` [N m] or [N]
+    :param smooth: the same with smoothed velocities
+    :param columns: what candidates would add
+    :param items: candidates, several with different settings
+    :param noisy: of columns that contain the acceleration, smoothed, the index of the same column
+        with the measured one
+    :param slopes: of the mass matrix by inertial parameters, by key of the candidate
+    :param drives: relative change of the actuators' force with a unit of a parameter at each joint,
+        by key of the candidate
+    """
+
+    twin: Twin
+    motion: Motion
+    rows: Rows
+    terms: Terms
+    effective: np.ndarray
+    load: np.ndarray
+    missing: np.ndarray
+    smooth: np.ndarray
+    columns: list[Column] = dataclasses.field(default_factory=list)
+    items: list[Item] = dataclasses.field(default_factory=list)
+    noisy: dict[int, int] = dataclasses.field(default_factory=dict)
+    slopes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    drives: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+
+def residual_force(inertia: np.ndarray, change: np.ndarray, dt: float) -> np.ndarray:
+    """:return: force that changes velocities by this much in an interval, shape ``(n, dof)``"""
+    return np.einsum("nij,nj->ni", inertia, change) / dt
 
 
 def put(made: Equation, joint: int | None, values: np.ndarray) -> int:
@@ -151,11 +155,11 @@ def put_acting(made: Equation, values: np.ndarray) -> int:
     return put(made, None, values)
 
 
-def ranges_of(made: Equation, rows: Rows, joint: int | None, actuator: int | None) -> Ranges:
+def ranges_of(made: Equation, joint: int | None, actuator: int | None) -> Ranges:
     """:return: ranges of the motion and the commands, from which effects choose their settings"""
     motion, command = made.motion, np.zeros(1)
     if actuator is not None:
-        command = rows.actions[:, actuator]
+        command = made.rows.actions[:, actuator]
     own = slice(None) if joint is None else slice(joint, joint + 1)
     return Ranges(
         excursion=float(np.max(motion.excursion[own])),

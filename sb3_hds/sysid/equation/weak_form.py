@@ -99,7 +99,7 @@ def weak_rows(equation: Equation, j: int) -> Rows:
     mass = float(np.median(equation.effective[:, j, j]))
 
     def against(half: int, left_out: np.ndarray) -> Rows:
-        projected, pieces = _against_bumps(table, equation.recording, left_out, half)
+        projected, pieces = _against_bumps(table, equation.rows.recording, left_out, half)
         y, x = projected[:, 0], projected[:, 1:]
         weight, scale = _huber(y, x[:, rich]) if len(y) else (y, 1.0)
         slope = np.linalg.norm(np.diff(_bump(half), prepend=0.0, append=0.0))
@@ -107,7 +107,7 @@ def weak_rows(equation: Equation, j: int) -> Rows:
             weight * y / scale,
             weight[:, None] * x / scale,
             used,
-            _blocks(pieces, equation.recording),
+            _blocks(pieces, equation.rows.recording),
             scale,
             float(mass * motion.noise_v[j] * slope / motion.dt / scale) if len(y) else 0.0,
             float(_bump(half).sum()),
@@ -117,7 +117,7 @@ def weak_rows(equation: Equation, j: int) -> Rows:
     def averaged(left_out: np.ndarray, wide: list[int], enough: float) -> Rows | None:
         made = None
         for half in wide:
-            n = sum(map(len, _begins(equation.recording, left_out, half)))
+            n = sum(map(len, _begins(equation.rows.recording, left_out, half)))
             if n <= enough * len(rich):
                 continue
             rows = made = against(half, left_out)
@@ -138,7 +138,7 @@ def _choices(
     :return: intervals to leave out, half widths of bumps, and rows per column that must remain, in
         order of preference
     """
-    v, motion = equation.v[:, j], equation.motion
+    v, motion = equation.rows.v[:, j], equation.motion
     slow = np.abs(v) < max(_ERRORS * motion.error_v[j], _REST * motion.speed[j])
     change = np.abs(np.diff(v, append=v[-1:]))
     stops = np.abs(v) < _STOPS * np.maximum(change, np.roll(change, 1))
@@ -247,8 +247,8 @@ def grams(equation: Equation) -> Grams:
     ratio of cluster-robust to naive variances of the rich model's coefficients.
     """
     n_columns, dof = len(equation.columns), equation.missing.shape[1]
-    pieces = max(1, -(-_BLOCKS // len(np.unique(equation.recording))))
-    n_blocks = (int(equation.recording.max()) + 1) * pieces
+    pieces = max(1, -(-_BLOCKS // len(np.unique(equation.rows.recording))))
+    n_blocks = (int(equation.rows.recording.max()) + 1) * pieces
     blocks = np.zeros((n_blocks, n_columns + 1, n_columns + 1))
     by_joint = np.zeros((dof, n_columns + 1, n_columns + 1))
     n_folds = min(_FOLDS, n_blocks)
