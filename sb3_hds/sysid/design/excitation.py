@@ -1,17 +1,17 @@
 r"""
-How well commands would decide between answers, as a differentiable program.
+How well commands discriminate between answers, as a differentiable program.
 
-Let answer :math:`a` be true. Recorded in windows, each simulated from a start state of its own,
-answer :math:`b` leaves at least
+Let answer :math:`a` be true. In windows that are simulated from start states of their own, the
+residual of answer :math:`b` is at least
 
 .. math::
    \lambda_{ab} = \min_{z, x_0} \frac{1}{c} \sum_k
    \left\| \frac{y_a - y_b(\theta_b + L_b z, x_0)}{\sigma} \right\|^2 + \|z\|^2,
 
-linear in the start states :math:`x_0` and in :math:`z`: what the earlier data allow :math:`b` to
-change (:math:`L_b L_b^T` is the covariance of its parameters) counts as already changed in its
-favour. Half of it is the expected log-likelihood ratio, all data taken together; :math:`c` is the
-number of rows for each independent one.
+linearised in the start states :math:`x_0` and in :math:`z`: the parameters of :math:`b` are
+refitted within what the earlier data allow (:math:`L_b L_b^T` is their covariance). Half of it is
+the expected log-likelihood ratio of all data; :math:`c` is the number of rows for each independent
+one.
 
 Source: T-optimality, Atkinson and Fedorov, *The design of experiments for discriminating between
 two rival models*, Biometrika 62(1), 1975, with the prior of Ponce de Leon and Atkinson, Biometrika
@@ -44,26 +44,26 @@ from sb3_hds.sysid.belief.answers import effect_key, effects_of
 from sb3_hds.sysid.design.limits import Bounds
 from sb3_hds.sysid.estimation.shooting import solve_normal, with_slopes
 
-# Frequencies in the commands, at most, and the share of a recording in which they fade in, and
-# out.
+# Most frequencies in the commands, and the share of a recording in which they fade in and out.
 _MOST_SINES, _FADE = 24, 0.04
-# Added to the evidence whose logarithm is maximised: less than this decides nothing. And how much
-# information about parameters counts beside it: where nothing decides, the machine moves at least.
+# Added to the ratio whose logarithm is maximised: smaller ones are negligible. Weight of the
+# information about parameters beside it, so that commands move the machine even where nothing
+# discriminates.
 _LEAST, _BESIDE = 1.0, 0.1
-# Price of exceeding a limit, in units of the limit, and the share of it from which it counts.
+# Penalty of exceeding a limit, in units of the limit, and the share of it from which it counts.
 _PRICE, _NEAR = 200.0, 0.85
 
 
 class DesignProblem(NamedTuple):
     """
-    The numbers of a design problem; those that no program depends on.
+    The numbers of a design problem: traced, so that one compiled program serves all of them.
 
     :param values: parameters of each answer, shape ``(m, p)``
     :param factor: of their covariances, shape ``(m, p, k)``
     :param corners: parameters for which limits hold, besides those of the answers, ``(c, p)``
     :param start: observation at the start, shape ``(n_obs,)``
     :param weight: reciprocal of the errors of each output, the channels first and then the forces
-        of the actuators at each joint; 0: it is not measured; shape ``(n_obs + dof,)``
+        of the actuators at each joint; 0 if it is not measured; shape ``(n_obs + dof,)``
     :param correlated: rows for each independent one
     """
 
@@ -77,7 +77,7 @@ class DesignProblem(NamedTuple):
 
 class Evaluation(NamedTuple):
     r"""
-    What commands for ``n`` recordings are worth, and what they ask of the machine.
+    Discrimination and usage of limits by commands for ``n`` recordings.
 
     :param ratios: :math:`\lambda_{ab}`, shape ``(m, m)``
     :param gains: information about the parameters of each answer [nats], shape ``(m,)``
@@ -98,9 +98,11 @@ class Evaluation(NamedTuple):
 class Excitation:
     """
     :param twin: has the effects of all answers
-    :param bounds: that hold
+    Commands as sums of sines, and what they would decide.
+
+    :param bounds: limits of the machine
     :param n_steps: of a recording
-    :param window: steps of the windows in which it will be compared
+    :param window: steps of the windows in which answers will be compared
     """
 
     def __init__(self, twin: Twin, bounds: Bounds, n_steps: int, window: int) -> None:
@@ -125,7 +127,7 @@ class Excitation:
     def commands(
         self, coefficients: Float[Array, "n waves act"] | np.ndarray
     ) -> Float[Array, "n steps act"]:
-        """:return: smooth, and within their limits whatever the coefficients are"""
+        """:return: smooth commands, within their limits for any coefficients"""
         low, high = self.bounds.command.T
         waves = jnp.einsum("tw,nwa->nta", self.basis, coefficients)
         return 0.5 * (low + high) + 0.5 * (high - low) * jnp.tanh(waves)
@@ -158,7 +160,7 @@ class Excitation:
         m = len(problem.values)
 
         def of(pair: Array) -> tuple[Array, Array, Array]:
-            """What answer ``b`` leaves of what ``a`` predicts, and what it says of ``b``."""
+            """Residual of answer ``b`` if ``a`` is true, and information about ``b``."""
             a, b = pair
             mine, theirs = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in (a, b))
             own = (jnp.asarray(problem.values[b]), jnp.asarray(problem.factor[b]))
@@ -175,7 +177,7 @@ class Excitation:
         return Evaluation(ratios.reshape(m, m), own, curvature[0], outputs[:m], usage)
 
     def _rollouts(self, actions: Array, problem: DesignProblem) -> tuple[State, Array, Array]:
-        """Of the answers, then of the corners; only the answers' states are returned."""
+        """Simulate the answers, then the corners; only the answers' states are returned."""
         vectors = jnp.concatenate([problem.values, problem.corners])
 
         def one(vector: Array, commands: Array) -> tuple[State, Array, Array]:
@@ -184,8 +186,8 @@ class Excitation:
             begin = jax.tree.map(lambda leaf: jnp.asarray(leaf, vector.dtype), begin)
             run = rollout(self.twin, params, begin, commands)
             force = self._forces(run.states, commands, params)
-            # What is on its way to the motor arrives, if only when the recording is over.
-            plain = self._forces(run.states, commands, params, on_its_way=False)
+            # Without the effects on commands too: a delayed command may act after the recording.
+            plain = self._forces(run.states, commands, params, with_effects=False)
             most = jnp.maximum(jnp.abs(force), jnp.abs(plain))
             outputs = jnp.concatenate([run.obs, force], 1)
             return run.states, outputs, self._usage(run.states, most)
@@ -195,17 +197,17 @@ class Excitation:
         return states, outputs, jnp.max(usage, (0, 1))
 
     def _forces(
-        self, states: State, commands: Array, params: Params, on_its_way: bool = True
+        self, states: State, commands: Array, params: Params, with_effects: bool = True
     ) -> Array:
         """
-        Of the actuators at each joint, shape ``(steps + 1, dof)``; zeros where unknown.
+        Forces of the actuators at each joint, shape ``(steps + 1, dof)``; zeros where unknown.
 
-        :param on_its_way: whether what happens to a command on its way to the motor counts
+        :param with_effects: whether effects on the commands, such as a gain or a delay, count
         """
         if not isinstance(plant_of(self.twin), AnalyticTwin):
             return jnp.zeros((len(commands) + 1, len(self.twin.joints)), commands.dtype)
         before = jax.tree.map(lambda leaf: leaf[:-1], states)
-        force = jax.vmap(lambda s, u: actuator_force(self.twin, s, u, params, on_its_way))(
+        force = jax.vmap(lambda s, u: actuator_force(self.twin, s, u, params, with_effects))(
             before, commands
         )
         return jnp.concatenate([force, force[-1:]])
@@ -239,10 +241,10 @@ class Excitation:
         commands: Array,
     ) -> tuple[Array, Array, Array]:
         """
-        One recording under answer ``b``, in windows that begin where answer ``a`` is.
+        One recording under answer ``b``, in windows that begin in the states of answer ``a``.
 
         :param mine: states of ``a``
-        :param theirs: states of ``b``, for what its drives remember
+        :param theirs: states of ``b``, for the memory of its drives
         :param seen: outputs of ``a``
         :return: sum of squares, scores and curvature by ``z``, start states eliminated
         """
@@ -284,12 +286,12 @@ class Excitation:
 
 
 def actuator_force(
-    twin: Twin, state: State, action: Array, params: Params, on_its_way: bool = True
+    twin: Twin, state: State, action: Array, params: Params, with_effects: bool = True
 ) -> Float[Array, " dof"]:
     """
     :param twin: of an ``AnalyticTwin``, with effects and wrappers or without
     :param action: as the outermost twin takes it, shape ``(n_act,)``
-    :param on_its_way: whether effects on the way of the command count, such as a gain or a delay
+    :param with_effects: whether effects on the command count, such as a gain or a delay
     :return: generalised force of the actuators at the beginning of a step [N m] or [N]
     """
     command = action
@@ -297,7 +299,7 @@ def actuator_force(
         if isinstance(layer, TransformedTwin):
             command = layer.command(state, command, params)
         elif isinstance(layer, ExtendedTwin):
-            if on_its_way:
+            if with_effects:
                 simulated = tuple(a for a in layer.attached if a.key in state.memory)
                 chain = EffectChain(simulated, params)
                 command, _ = chain.act(command, state.memory, twin.dt / twin.substeps)

@@ -1,10 +1,10 @@
-"""The recording that would decide, found by gradients through the twins."""
+"""Design of the next recording, by gradients through the twins."""
 
 import dataclasses
 import itertools
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -32,20 +32,19 @@ from sb3_hds.sysid.design.limits import BY_JOINT, Limits
 from sb3_hds.sysid.design.result import SURE, NextExperiment, Pair
 from sb3_hds.sysid.reporting.wording import with_unit
 
-# Starts of the search, its steps, and their size, in units of the coefficients.
+# Starts of the search, its steps, and the learning rate, in units of the coefficients.
 _STARTS, _STEPS, _RATE = 6, 120, 0.05
-# What is used of a limit at most: real machines are none of the answers.
+# Largest usage of a limit: the real machine differs from every answer.
 _MOST = 0.9
-# Parameters of each answer for which limits hold besides: this many standard deviations either way
-# along the widest directions of its covariance.
+# Limits also hold for parameters this many standard deviations off, along this many of the widest
+# directions of each answer's covariance.
 _DEVIATIONS, _DIRECTIONS = 2.0, 2
 # Odds at which answers count as decided.
 _ODDS = 19.0
-# Recordings beyond which an experiment is no way to decide, and of those that another sensor or a
-# load may take.
+# Largest number of recordings to decide, and of recordings with another sensor or a load.
 _MOST_RECORDINGS, _FEW = 100, 10
-# Of a force sensor, its error as a share of the largest force; of a known load, its force as a
-# share of that; of better sensors, by how much.
+# Error of a force sensor and size of a known load, in shares of the largest force; factor by which
+# better sensors are better.
 _SENSOR, _LOAD, _FINER = 0.02, 0.3, 10.0
 
 
@@ -69,7 +68,7 @@ def next_experiment(
     """
     (first, *others) = answers.answers
     if not (others or first.factor):
-        # Nothing is wrong and nothing uncertain: what would show if it were there?
+        # Nothing is wrong or uncertain: design for friction, which may be too small to show.
         answers = dataclasses.replace(answers, answers=(everything_open(first.twin),))
     twin, problem, loads = design_problem(answers, start)
     bounds = Limits.of(limits).at(twin)
@@ -146,7 +145,7 @@ def _with_loads(
     twin: Twin, values: np.ndarray, factor: np.ndarray
 ) -> tuple[Twin, np.ndarray, np.ndarray, tuple[int, ...]]:
     """
-    A constant force at each joint, zero unless a known load is tried.
+    Add a constant force at each joint, zero unless a known load is tried.
 
     :return: the twin with them, its parameter vectors and factors, and their indices
     """
@@ -184,10 +183,10 @@ def _corners(twin: Twin, values: np.ndarray, factor: np.ndarray) -> np.ndarray:
 def _found(
     excitation: Excitation, problem: DesignProblem, n: int, seed: int, progress: bool
 ) -> Float[np.ndarray, "n waves act"]:
-    """:return: the best coefficients that were met on the way of any start, within all limits"""
+    """:return: the best coefficients along the search from all starts, within all limits"""
     rng, n_act = np.random.default_rng(seed), len(excitation.twin.actuators)
     shape = (_STARTS, n, excitation.basis.shape[1], n_act)
-    # Lower frequencies move a machine further; starts are of unequal strength.
+    # Lower frequencies move a machine further; starts differ in amplitude.
     falling = 1.0 / np.sqrt(1.0 + excitation.cycles)[:, None]
     strength = np.geomspace(0.1, 1.0, _STARTS)[:, None, None, None]
     now = strength * falling * rng.standard_normal(shape) / np.sqrt(np.sum(falling**2) / 2.0)
@@ -226,8 +225,8 @@ def _pairs(answers: Answers, ratios: np.ndarray, n: int) -> tuple[Pair, ...]:
 
 def _pair(true: str, other: str, strength: float, n: int) -> Pair:
     """
-    The logarithm of the likelihood ratio is normal with half of ``strength`` as its mean and
-    ``strength`` as its variance.
+    The logarithm of the likelihood ratio is normal, with mean ``strength / 2`` and variance
+    ``strength``.
     """
     strength = max(strength, 1e-12)
     threshold, sure = math.log(_ODDS), float(scipy.stats.norm.ppf(SURE))
@@ -237,52 +236,45 @@ def _pair(true: str, other: str, strength: float, n: int) -> Pair:
 
 
 def _would_tell(
-    excitation: Excitation, actions: Any, problem: DesignProblem, outputs: np.ndarray, loads: Any
+    excitation: Excitation,
+    actions: np.ndarray,
+    problem: DesignProblem,
+    outputs: np.ndarray,
+    loads: Sequence[int],
 ) -> tuple[str, ...]:
-    """What makes the pair that is hardest to tell apart easy, with the same commands."""
-    twin, m = excitation.twin, len(problem.values)
-    n_obs = len(twin.channels)
+    """What would decide the hardest pair of answers with the same commands, in words."""
+    twin, n_obs = excitation.twin, len(excitation.twin.channels)
     largest = np.abs(outputs[..., n_obs:]).max((0, 1, 2))
-    enough = _pair("", "", 1.0, 1).needed
-
-    def in_words(changed: DesignProblem) -> str:
-        """Nothing where a few such recordings would not tell."""
-        ratios = np.asarray(excitation.evaluate(actions, changed).ratios)
-        needed = enough / max(float(ratios[~np.eye(m, dtype=bool)].min()), 1e-12)
-        if needed > _FEW:
-            return ""
-        return "would tell." if needed <= 1.0 else f"would tell in {math.ceil(needed)} recordings."
-
-    told = []
+    trials: list[tuple[str, DesignProblem]] = []
     for j, joint in enumerate(twin.joints):
-        unit = "N" if joint.unit == "m" else "N m"
         if not largest[j] > 0.0:
             continue
-        weight = problem.weight.copy()
+        unit = "N" if joint.unit == "m" else "N m"
+        error, force = (with_unit(f"{share * largest[j]:.2g}", unit) for share in (_SENSOR, _LOAD))
+        weight, values = problem.weight.copy(), problem.values.copy()
         weight[n_obs + j] = 1.0 / (_SENSOR * largest[j])
-        if verb := in_words(problem._replace(weight=weight)):
-            error = with_unit(f"{_SENSOR * largest[j]:.2g}", unit)
-            told.append(
-                f"A sensor of the actuator's force at {joint.name}, good to {error}, {verb}"
-            )
-        if loads[j] < 0:
-            continue
-        values = problem.values.copy()
-        values[:, loads[j]] += _LOAD * largest[j]
-        if verb := in_words(problem._replace(values=values)):
-            force = with_unit(f"{_LOAD * largest[j]:.2g}", unit)
-            told.append(
+        words = f"A sensor of the actuator's force at {joint.name}, good to {error},"
+        trials.append((words, problem._replace(weight=weight)))
+        if loads[j] >= 0:
+            values[:, loads[j]] += _LOAD * largest[j]
+            words = (
                 f"A known load at {joint.name}, a constant force of {force} as of a weight on a "
-                f"string, {verb}"
+                "string,"
             )
-    if verb := in_words(problem._replace(weight=_FINER * problem.weight)):
-        told.append(f"Errors {_FINER:.0f} times smaller, of sensors and of the model, {verb}")
-    if not told:
-        told.append(
-            "Neither a force sensor nor a known load nor ten times better sensors would tell with "
-            "these commands: to a policy, the answers may be the same."
-        )
-    return tuple(told)
+            trials.append((words, problem._replace(values=values)))
+    words = f"Errors {_FINER:.0f} times smaller, of sensors and of the model,"
+    trials.append((words, problem._replace(weight=_FINER * problem.weight)))
+    found, others = [], ~np.eye(len(problem.values), dtype=bool)
+    for words, changed in trials:
+        ratios = np.asarray(excitation.evaluate(actions, changed).ratios)
+        needed = _pair("", "", float(ratios[others].min()), 1).needed
+        if needed <= _FEW:
+            often = "" if needed <= 1.0 else f" in {math.ceil(needed)} recordings"
+            found.append(f"{words} would tell{often}.")
+    return tuple(found) or (
+        "Neither a force sensor nor a known load nor ten times better sensors would tell with "
+        "these commands: to a policy, the answers may be the same.",
+    )
 
 
 def _narrower(

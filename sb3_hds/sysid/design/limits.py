@@ -1,4 +1,4 @@
-"""What a machine may do while it is being identified."""
+"""Limits of a machine during identification."""
 
 import dataclasses
 import math
