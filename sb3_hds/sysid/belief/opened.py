@@ -115,7 +115,10 @@ def _answer(
     if not base.free:
         return Answer(keys, twin, {}, float(log_weight))
     covariance = joint_covariance(every, point, base.free)
-    factor = factor_of(covariance, _typical(search, point.theta)[list(base.free)])
+    # Typical deviations: the declared one, the smallest that these data show, or what was found.
+    declared = np.array([h.parameter(name).scale for name in h.names])
+    typical = np.maximum(np.maximum(declared, h.scale), np.abs(point.theta - h.null))
+    factor = factor_of(covariance, typical[list(base.free)])
     rows: dict[str, np.ndarray] = {}
     for row, i in zip(factor, base.free, strict=True):
         inward = -1.0 if point.theta[i] + _STEP * h.scale[i] > h.upper[i] else 1.0
@@ -127,16 +130,6 @@ def _answer(
             if abs(slope) > 1e-9:
                 rows[name] = rows.get(name, np.zeros(len(factor))) + slope * row
     return Answer(keys, twin, rows, float(log_weight))
-
-
-def _typical(search: Search, theta: np.ndarray) -> np.ndarray:
-    """
-    :return: typical deviations: the declared one, the smallest that these data show, or the size
-        that was found, whichever is larger
-    """
-    h = search.hypotheses
-    declared = np.array([h.parameter(name).scale for name in h.names])
-    return np.maximum(np.maximum(declared, h.scale), np.abs(theta - h.null))
 
 
 def joint_covariance(half: Half, point: Point, free: Sequence[int]) -> np.ndarray:

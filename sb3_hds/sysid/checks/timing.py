@@ -16,7 +16,7 @@ from sb3_hds.core import (
     semi_implicit_euler,
 )
 from sb3_hds.core.numerics.integrators import Integrator
-from sb3_hds.core.twin import layers_of, plant_of
+from sb3_hds.core.twin import layers_of
 from sb3_hds.data.audit.results import shifted
 from sb3_hds.data.audit.velocity import Lag, lags_of
 from sb3_hds.sysid.checks.conventions import residual_beside_friction
@@ -111,8 +111,8 @@ def match_logged_integrator(
     :param data: sampled at the twin's ``dt``
     :return: the twin, the data, and what was changed, in words
     """
-    plant = plant_of(twin)
-    if lag_of(twin) != 0.0 or not isinstance(plant, AnalyticTwin) or not _bare(twin):
+    bare = all(isinstance(layer, ExtendedTwin | AnalyticTwin) for layer in layers_of(twin))
+    if lag_of(twin) != 0.0 or not bare:
         return twin, data, ()
     channels = [e.velocity for e in encoders(twin).values() if e.velocity is not None]
     if not channels:
@@ -143,11 +143,6 @@ def stepping_by(twin: Twin, integrator: Integrator) -> Twin:
     changed = copy.copy(twin)
     changed.integrator = integrator  # type: ignore[attr-defined]  # of the class, else
     return changed
-
-
-def _bare(twin: Twin) -> bool:
-    """Whether no wrapper is around the plant and its effects."""
-    return all(isinstance(layer, ExtendedTwin | AnalyticTwin) for layer in layers_of(twin))
 
 
 def _log_residual(twin: Twin, data: Trajectories) -> float:

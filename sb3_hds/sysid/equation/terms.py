@@ -146,26 +146,17 @@ def _one_step(
     twin: Twin, params: Params, push: Array, state: State, action: Array
 ) -> tuple[State, tuple]:
     plant = plant_of(twin)
-    if isinstance(plant, AnalyticTwin):
-        pushes = [Attached(f"push.{j}", ConstantForce().at(j), j) for j in range(len(push))]
-        sizes = {f"{a.key}.tau_0": push[a.index] for a in pushes}
-        memory = state.memory | {a.key: () for a in pushes}
-        after = twin.step(
-            state._replace(memory=memory), action, params, EffectChain(tuple(pushes), sizes)
-        )
-        after = after._replace(memory={key: after.memory[key] for key in state.memory})
-    else:
-        after = twin.step(state, action, params)
-    if isinstance(plant, AnalyticTwin):
-        found = (
-            plant.mass_matrix(state.q, params),
-            plant.actuate(state, action, params),
-            plant.bias(state.q, state.v, params),
-        )
-    else:
-        still = jnp.zeros_like(state.v)
-        found = jnp.eye(len(state.v), dtype=state.v.dtype), still, still
-    return after, (after.v - state.v, *found)
+    if not isinstance(plant, AnalyticTwin):
+        after, still = twin.step(state, action, params), jnp.zeros_like(state.v)
+        return after, (after.v - state.v, jnp.eye(len(still), dtype=still.dtype), still, still)
+    pushes = [Attached(f"push.{j}", ConstantForce().at(j), j) for j in range(len(push))]
+    sizes = {f"{a.key}.tau_0": push[a.index] for a in pushes}
+    pushed = state._replace(memory=state.memory | {a.key: () for a in pushes})
+    after = twin.step(pushed, action, params, EffectChain(tuple(pushes), sizes))
+    after = after._replace(memory={key: after.memory[key] for key in state.memory})
+    mass = plant.mass_matrix(state.q, params)
+    actuator, bias = plant.actuate(state, action, params), plant.bias(state.q, state.v, params)
+    return after, (after.v - state.v, mass, actuator, bias)
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
