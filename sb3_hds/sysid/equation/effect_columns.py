@@ -190,27 +190,26 @@ def add_command(made: Equation, candidate: Candidate, effect: ActionEffect) -> N
     twin, rows, i = made.twin, made.rows, candidate.index
     if not rows.actions.size or not np.ptp(rows.actions[:, i]) > 0.0:
         return
-    settings, names = effect.grid(ranges_of(made, None, i)), tuple(effect.parameters)
+    settings = effect.grid(ranges_of(made, None, i))
     nulls = {name: p.null for name, p in effect.parameters.items()}
     if effect.chained and len(settings) < 2:
         return
+    steps = {name: STEP * p.scale for name, p in effect.parameters.items()}
+    given = [{**nulls, **at} for at in settings]
     if not effect.chained:
-        steps = [STEP * effect.parameters[name].scale for name in names]
-        given = [{**nulls, name: nulls[name] + s} for name, s in zip(names, steps, strict=True)]
-    else:
-        given = [{**nulls, **at} for at in settings]
+        given = [{**nulls, name: nulls[name] + step} for name, step in steps.items()]
     commands = _commanded(made, effect, given, i)
     before = forces(twin, twin.params, rows.q, rows.v, rows.actions[None])[0]
     after = forces(twin, twin.params, rows.q, rows.v, commands)
     changes = after - before
     if not effect.chained:
-        columns, useful = [], []
-        for name, step, change in zip(names, steps, changes, strict=True):
-            if np.abs(change).max() > 0.0:
-                columns.append(put_acting(made, change / step))
-                useful.append(name)
+        columns = {
+            name: put_acting(made, change / step)
+            for (name, step), change in zip(steps.items(), changes, strict=True)
+            if np.abs(change).max() > 0.0
+        }
         if columns:
-            made.items.append(Item(candidate, tuple(columns), tuple(useful)))
+            made.items.append(Item(candidate, (*columns.values(),), (*columns,)))
         return
     for k in range(len(settings) - 1):
         whole = put_acting(made, changes[k])

@@ -184,16 +184,17 @@ def ties_of(
     found = {}
     for shared in candidates:
         if shared.place == EVERY:
-            own = [c for c in single if (c.name, c.slot) == (shared.name, "actuator")]
-            own = [c for c in own if c.place != EVERY]
+            slot, where = "actuator", {actuator.name for actuator in twin.actuators}
         elif shared.slot == "joint" and shared.name in _DERIVED:
             channels = encoders(twin)[shared.index].channels
-            own = [c for c in single if (c.name, c.slot) == (shared.name, "channel")]
-            own = [c for c in own if c.index in channels]
+            slot, where = "channel", {twin.channels[i].name for i in channels}
         else:
             continue
+        own = [
+            c.key for c in single if (c.name, c.slot) == (shared.name, slot) and c.place in where
+        ]
         for short, name in shared.full_names.items():
-            found[name] = tuple(f"{c.key}.{short}" for c in own)
+            found[name] = tuple(f"{key}.{short}" for key in own)
     return found
 
 
