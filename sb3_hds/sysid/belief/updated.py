@@ -66,10 +66,10 @@ def updated(answers: Answers, data: Trajectories) -> Answers:
         answers.answers, values, factor, fitted, strict=True
     ):
         theta = np.clip(value + own @ z, low, high)
-        spread = np.linalg.cholesky(np.linalg.inv(curvature))
+        narrower = np.linalg.cholesky(np.linalg.inv(curvature))
         cost = float(cost) + float(np.linalg.slogdet(curvature)[1])
         cost = cost if np.isfinite(cost) else np.inf
-        found.append(_answer(answer, twin, theta, own @ spread, answer.log_weight - 0.5 * cost))
+        found.append(_answer(answer, twin, theta, own @ narrower, answer.log_weight - 0.5 * cost))
     found.sort(key=lambda answer: -answer.log_weight)
     return dataclasses.replace(answers, answers=tuple(found))
 

@@ -137,23 +137,23 @@ class Excitation:
     ) -> tuple[Array, Array, Array]:
 
         def cost(one: Array) -> tuple[Array, tuple[Array, Array]]:
-            told = self._evaluate(self.commands(one), problem)
-            m, usage = len(problem.values), told.usage
+            evaluation = self._evaluate(self.commands(one), problem)
+            m, usage = len(problem.values), evaluation.usage
             if m == 1:
-                worth = told.gains[0]
+                objective = evaluation.gains[0]
             else:
-                pairs = told.ratios[~np.eye(m, dtype=bool)]
-                worth = -jnp.log(jnp.mean(1.0 / (pairs + _LEAST)))
-                worth += _BESIDE * jnp.mean(told.gains)
+                pairs = evaluation.ratios[~np.eye(m, dtype=bool)]
+                objective = -jnp.log(jnp.mean(1.0 / (pairs + _LEAST)))
+                objective += _BESIDE * jnp.mean(evaluation.gains)
             finite = jnp.where(jnp.isfinite(usage), usage, 1e3)
             over = jnp.maximum(finite - _NEAR, 0.0)
-            return -worth + _PRICE * jnp.sum(over**2), (worth, jnp.max(finite))
+            return -objective + _PRICE * jnp.sum(over**2), (objective, jnp.max(finite))
 
         if self.twin.differentiability == "reverse":
-            (_, told), slopes = jax.vmap(jax.value_and_grad(cost, has_aux=True))(coefficients)
+            (_, found), slopes = jax.vmap(jax.value_and_grad(cost, has_aux=True))(coefficients)
         else:
-            slopes, told = jax.vmap(jax.jacfwd(cost, has_aux=True))(coefficients)
-        return told[0], told[1], slopes
+            slopes, found = jax.vmap(jax.jacfwd(cost, has_aux=True))(coefficients)
+        return found[0], found[1], slopes
 
     def _evaluate(self, actions: Float[Array, "n steps act"], problem: DesignProblem) -> Evaluation:
         states, outputs, usage = self._rollouts(actions, problem)
@@ -267,8 +267,8 @@ class Excitation:
                 there = jax.tree.map(lambda leaf, was: leaf.astype(was.dtype), there, begin)
                 run = rollout(self.twin, params, there, actions)
                 force = self._forces(run.states, actions, params)
-                told = jnp.concatenate([run.obs, force], 1)
-                return ((told - outputs)[:-1] * weight).ravel()
+                predicted = jnp.concatenate([run.obs, force], 1)
+                return ((predicted - outputs)[:-1] * weight).ravel()
 
             now, slopes = with_slopes(error, jnp.zeros(n_z + n_x, begin.q.dtype))
             by_z, by_x = slopes[:, :n_z], slopes[:, n_z:]

@@ -77,14 +77,14 @@ def next_experiment(
         excitation = Excitation(twin, bounds, n_steps, answers.window)
         found = _found(excitation, problem, n, seed, progress)
         actions = np.asarray(excitation.commands(jnp.asarray(found)))
-        told = jax.tree.map(np.asarray, excitation.evaluate(actions, problem))
-        pairs = _pairs(answers, told.ratios, n)
+        evaluation = jax.tree.map(np.asarray, excitation.evaluate(actions, problem))
+        pairs = _pairs(answers, evaluation.ratios, n)
         decides = not pairs or bool(pairs[0].needed <= _MOST_RECORDINGS)
         would_tell = ()
         if not decides:
-            would_tell = _would_tell(excitation, actions, problem, told.outputs, loads)
+            would_tell = _would_tell(excitation, actions, problem, evaluation.outputs, loads)
     alone = len(answers.answers) == 1
-    outputs = told.outputs[..., : len(twin.channels)]
+    outputs = evaluation.outputs[..., : len(twin.channels)]
     return NextExperiment(
         commands=Trajectories.from_arrays(
             outputs[0], actions, dt=twin.dt, conditions="designed experiment"
@@ -94,9 +94,9 @@ def next_experiment(
         channels=tuple((c.name, c.unit) for c in twin.channels),
         actuators=tuple((a.name, a.unit) for a in twin.actuators),
         pairs=pairs,
-        information=float(told.gains[0]),
-        narrower=_narrower(twin, problem, told.curvature) if alone else {},
-        usage=_usage(told.usage, twin),
+        information=float(evaluation.gains[0]),
+        narrower=_narrower(twin, problem, evaluation.curvature) if alone else {},
+        usage=_usage(evaluation.usage, twin),
         decides=decides,
         would_tell=would_tell,
     )
@@ -191,20 +191,20 @@ def _found(
     strength = np.geomspace(0.1, 1.0, _STARTS)[:, None, None, None]
     now = strength * falling * rng.standard_normal(shape) / np.sqrt(np.sum(falling**2) / 2.0)
     optimizer = optax.adam(optax.cosine_decay_schedule(_RATE, _STEPS))
-    state, best, worth = optimizer.init(now), None, -np.inf
+    state, best, highest = optimizer.init(now), None, -np.inf
     steps = track(range(_STEPS), "designing", transient=True, disable=not progress)
     for _ in steps:
-        told, usage, slopes = map(np.asarray, excitation.ascent(now, problem))
-        inside = np.where(np.isfinite(told) & (usage <= _MOST), told, -np.inf)
-        if inside.max() > worth:
-            worth, best = float(inside.max()), np.array(now[int(inside.argmax())])
+        objective, usage, slopes = map(np.asarray, excitation.ascent(now, problem))
+        inside = np.where(np.isfinite(objective) & (usage <= _MOST), objective, -np.inf)
+        if inside.max() > highest:
+            highest, best = float(inside.max()), np.array(now[int(inside.argmax())])
         slopes = np.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)
         norm = np.sqrt(np.sum(slopes**2, (1, 2, 3), keepdims=True))
         step, state = optimizer.update(slopes / np.maximum(norm, 1.0), state, now)
         now = np.asarray(optax.apply_updates(now, step))
     if best is None:
-        told = excitation.evaluate(excitation.commands(now[0]), problem)
-        usage = _usage(np.asarray(told.usage), excitation.twin)
+        found = excitation.evaluate(excitation.commands(now[0]), problem)
+        usage = _usage(np.asarray(found.usage), excitation.twin)
         worst = max(usage, key=usage.__getitem__)
         raise CalibrationError(
             f"No commands were found that keep all limits under every answer: {worst} is taken to "
