@@ -28,10 +28,10 @@ from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.belief.answers import Answer, Answers, bounds_of, union
 from sb3_hds.sysid.estimation.shooting import (
     Shots,
+    eliminate_start,
     n_free,
     shots_of,
     simulate,
-    solve_normal,
     with_slopes,
 )
 
@@ -103,11 +103,7 @@ def _fitted(
 
     def window(shot: Shots, x: Array, z: Array) -> tuple[Array, ...]:
         now, slopes = with_slopes(partial(errors, shot), jnp.concatenate([z, x]))
-        by_z, by_x = slopes[:, :n_z], slopes[:, n_z:]
-        both = jnp.concatenate([now[:, None], by_z], 1)
-        moves = jax.vmap(partial(solve_normal, by_x), 1, 1)(both)
-        free = both - by_x @ moves
-        own, along = free[:, 0], free[:, 1:]
+        own, along, moves = eliminate_start(now, slopes, n_z)
         return now @ now, along.T @ own, along.T @ along, moves
 
     def normal(z: Array, x: Array) -> tuple[Array, Array, Array, Array]:

@@ -25,7 +25,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from sb3_hds.core import (
@@ -42,7 +41,7 @@ from sb3_hds.core import (
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.sysid.belief.answers import effect_key, effects_of
 from sb3_hds.sysid.design.limits import Bounds
-from sb3_hds.sysid.estimation.shooting import solve_normal, with_slopes
+from sb3_hds.sysid.estimation.shooting import eliminate_start, moved_by, with_slopes
 
 # Most frequencies in the commands, and the share of a recording in which they fade in and out.
 _MOST_SINES, _FADE = 24, 0.04
@@ -257,24 +256,17 @@ class Excitation:
         n_z, n_x = factor.shape[1], 2 * len(self.twin.joints)
 
         def window(begin: State, actions: Array, outputs: Array) -> tuple[Array, Array, Array]:
-            rest = ravel_pytree(begin.memory)[0]
-
             def error(both: Array) -> Array:
                 params = self._params(values + factor @ both[:n_z])
-                there = self.twin.retract(
-                    begin, jnp.concatenate([both[n_z:], jnp.zeros_like(rest)])
-                )
+                there = moved_by(self.twin, begin, both[n_z:])
                 there = jax.tree.map(lambda leaf, was: leaf.astype(was.dtype), there, begin)
                 run = rollout(self.twin, params, there, actions)
                 force = self._forces(run.states, actions, params)
                 predicted = jnp.concatenate([run.obs, force], 1)
                 return ((predicted - outputs)[:-1] * weight).ravel()
 
-            now, slopes = with_slopes(error, jnp.zeros(n_z + n_x, begin.q.dtype))
-            by_z, by_x = slopes[:, :n_z], slopes[:, n_z:]
-            both = jnp.concatenate([now[:, None], by_z], 1)
-            free = both - by_x @ jax.vmap(partial(solve_normal, by_x), 1, 1)(both)
-            own, along = free[:, 0], free[:, 1:]
+            errors, slopes = with_slopes(error, jnp.zeros(n_z + n_x, begin.q.dtype))
+            own, along, _ = eliminate_start(errors, slopes, n_z)
             return own @ own, along.T @ own, along.T @ along
 
         found = jax.vmap(window)(begins, commands[rows], outputs)

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,14 @@ class Limits:
         if isinstance(given, Limits):
             return given
         if isinstance(given, str | os.PathLike):
-            given = _read(given)
+            import yaml
+
+            path, text = given, Path(given).read_text(encoding="utf-8")
+            try:
+                given = yaml.safe_load(text) or {}
+            except yaml.YAMLError as error:
+                words = " ".join(str(error).split())
+                raise ParameterError(f"{path} is no yml: {words}.") from None
         known = [field.name for field in dataclasses.fields(cls)]
         if not isinstance(given, Mapping):
             raise ParameterError(
@@ -123,16 +131,6 @@ class Bounds:
     power: np.ndarray
     jerk: np.ndarray
     bandwidth: float
-
-
-def _read(path: str | os.PathLike[str]) -> Any:
-    import yaml
-
-    with open(path, encoding="utf-8") as file:
-        try:
-            return yaml.safe_load(file) or {}
-        except yaml.YAMLError as error:
-            raise ParameterError(f"{path} is no yml: {' '.join(str(error).split())}.") from None
 
 
 def _pairs(

@@ -90,10 +90,12 @@ class NextExperiment:
             return f"Play {what}: it is worth {self.information:.1f} nats about the parameters."
         worst = self.pairs[0]
         if not self.decides:
+            every = {frozenset(p[:2]) for p in self.pairs}
+            sure = every - {frozenset(p[:2]) for p in self.pairs if p.chance < SURE}
+            some = f" Of {len(every)} pairs of answers, it tells {len(sure)} apart." if sure else ""
             return (
                 f"No recording within these limits tells {worst.true} from {worst.other}: the best "
-                f"that was found would have to be made {_number(worst.needed)} times."
-                f"{self._at_least()}"
+                f"that was found would have to be made {_number(worst.needed)} times.{some}"
             )
         if worst.chance >= SURE:
             return f"Play {what}: the answers are told apart with a chance of {worst.chance:.0%}."
@@ -101,14 +103,6 @@ class NextExperiment:
             f"Play {what}, {math.ceil(worst.needed)} times in all: one of them tells "
             f"{worst.true} from {worst.other} with a chance of {worst.chance:.0%}."
         )
-
-    def _at_least(self) -> str:
-        """:return: how many pairs the recordings decide, if not all; otherwise empty"""
-        unsure = {frozenset(p[:2]) for p in self.pairs if p.chance < SURE}
-        every = {frozenset(p[:2]) for p in self.pairs}
-        if unsure == every:
-            return ""
-        return f" Of {len(every)} pairs of answers, it tells {len(every - unsure)} apart."
 
     def summary(self) -> str:
         """:return: all of it in 80 columns"""

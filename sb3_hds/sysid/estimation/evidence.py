@@ -244,11 +244,6 @@ class Evidence:
                 found.append((portion, slice(first, min(first + self.portion, self.shots.n))))
         return found
 
-    def _width_for(self, index: np.ndarray) -> int:
-        n, rows = self.shots.obs.shape[:2]
-        large = len(self.hypotheses.twin.joints) > _MANY_JOINTS
-        return 0 if not len(index) and (large or n * rows > _MANY_STEPS) else self.width
-
     def _lead_under(self, theta: np.ndarray, index: np.ndarray) -> int:
         """:return: steps before a window in which memory must be filled under these parameters"""
         h = self.hypotheses
@@ -275,8 +270,10 @@ class Evidence:
         h, n_lead = self.hypotheses, self._lead_under(theta, index)
         filled = np.zeros((self.portion, offsets.shape[1]))
         filled[:n] = offsets
-        slopes = []
-        for own in _in_groups(index, self._width_for(index), len(theta)):
+        n_steps = self.shots.obs[..., 0].size
+        large = len(h.twin.joints) > _MANY_JOINTS or n_steps > _MANY_STEPS
+        width, slopes = 0 if large and not len(index) else self.width, []
+        for own in _in_groups(index, width, len(theta)):
             alone = _LAPACK if uses_lapack(len(h.twin.joints)) else nullcontext()
             with jax.enable_x64(True), alone:
                 found = _errors_and_slopes(

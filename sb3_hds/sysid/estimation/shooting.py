@@ -6,6 +6,7 @@ states keep the noise of one measurement from biasing an entire window.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -176,7 +177,7 @@ def simulate(
         state, simulated = now
         place = i - lead
         seen = twin.infer(obs[i], params)
-        seen = _moved(twin, seen, jnp.where(place == 0, offset, 0.0))
+        seen = moved_by(twin, seen, jnp.where(place == 0, offset, 0.0))
         q, v = (jnp.where(place > 0, *pair) for pair in zip(state[:2], seen[:2], strict=True))
         state = State(q, v, state.memory)
         after = twin.step(state, actions[i], params, effects)
@@ -264,7 +265,21 @@ def solve_normal(slopes: Array, right: Array) -> Array:
     return solve_spd(normal, slopes.T @ right)
 
 
-def _moved(twin: Twin, state: State, offset: Offset) -> State:
+def eliminate_start(errors: Array, slopes: Array, n: int) -> tuple[Array, Array, Array]:
+    """
+    :param errors: of a window
+    :param slopes: by ``n`` parameters, then by the start state
+    :return: errors and slopes by the parameters, start state eliminated, and how it follows both
+    """
+    by_theta, by_start = slopes[:, :n], slopes[:, n:]
+    both = jnp.concatenate([errors[:, None], by_theta], 1)
+    moves = jax.vmap(partial(solve_normal, by_start), 1, 1)(both)
+    free = both - by_start @ moves
+    return free[:, 0], free[:, 1:], moves
+
+
+def moved_by(twin: Twin, state: State, offset: Offset) -> State:
+    """:return: the state with positions and velocities moved along a tangent vector"""
     rest = ravel_pytree(state.memory)[0]
     return twin.retract(state, jnp.concatenate([offset, jnp.zeros_like(rest)]))
 
