@@ -88,14 +88,14 @@ def bounded(errors: np.ndarray) -> np.ndarray:
     return np.nan_to_num(np.minimum(errors, NOT_FINITE), nan=NOT_FINITE)
 
 
-def _shown(unit: Int[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
+def _shown(cluster: Int[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
     """
-    :param unit: recording, or piece of one, of each window
+    :param cluster: recording, or piece of one, of each window
     :return: indices of the windows of the first recordings that have enough of them
     """
-    shown = np.zeros(len(unit), bool)
-    for one in dict.fromkeys(unit.tolist()):
-        shown |= unit == one
+    shown = np.zeros(len(cluster), bool)
+    for one in dict.fromkeys(cluster.tolist()):
+        shown |= cluster == one
         if shown.sum() >= _LEAST_SHOWN:
             break
     return np.flatnonzero(shown)
