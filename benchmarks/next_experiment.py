@@ -148,7 +148,7 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
     from sb3_hds import Trajectories, diagnose
     from sb3_hds.effects import ALL
     from sb3_hds.sysid.design.excitation import Excitation
-    from sb3_hds.sysid.design.experiment import question
+    from sb3_hds.sysid.design.experiment import design_problem
     from sb3_hds.sysid.design.limits import Limits
 
     began = time.time()
@@ -174,7 +174,7 @@ def run(system: str, number: int, budget: str) -> list[dict[str, Any]]:
     limits = limits_of(system, motion)
     start = rig.seen(np.concatenate([rig.around, np.zeros(rig.dof)])[None])[0]
     seconds, rows = N_STEPS * rig.dt, []
-    union, numbers, _ = question(found.answers, start)
+    union, numbers, _ = design_problem(found.answers, start)
     excitation = Excitation(union, Limits.of(limits).at(union), N_STEPS, found.answers.window)
     designed = found.next_experiment(limits, seconds=seconds, start=start, progress=False)
     rng = np.random.default_rng([number, zlib.crc32(system.encode())])
@@ -297,7 +297,7 @@ def as_large_as_allowed(
     with jax.enable_x64(True):
         for _ in range(_HALVINGS):
             size = high if low == 0.0 and high == 1.0 else 0.5 * (low + high)
-            usage = np.asarray(excitation.told(size * shape[None], numbers).usage)
+            usage = np.asarray(excitation.evaluate(size * shape[None], numbers).usage)
             inside = bool(np.isfinite(usage).all() and usage.max() <= _MOST)
             if inside and size == 1.0:
                 return shape

@@ -428,8 +428,8 @@ def _usual(system: str, noise: str, seen: str, loop: str) -> Usual:
 
 def _measured(system: str, noise: str, seen: str, loop: str) -> dict[str, Any]:
     from sb3_hds import effects
-    from sb3_hds.sysid.equation.motion import motion
     from sb3_hds.sysid.equation.screening import screen
+    from sb3_hds.sysid.motion.motion import motion
 
     case = dataclasses.replace(nothing(system, noise), kind=SEVERAL, seen=seen, loop=loop)
     data, moved = _driven(case, 99)

@@ -84,7 +84,7 @@ def _timed(rule: Callable[[], list[str]]) -> Answer:
 # ------------------------------------------------------------------------------ equation of motion
 def regression_of(screened: Any) -> Regression:
     """:param screened: a `sb3_hds.sysid.equation.screening.Screened`"""
-    from sb3_hds.sysid.equation.columns import equation
+    from sb3_hds.sysid.equation.assembly import equation
     from sb3_hds.sysid.equation.terms import terms
 
     motion, twin = screened.motion, screened.hypotheses.believed

@@ -14,9 +14,8 @@ from sb3_hds.core import rollout
 from sb3_hds.core.belief import BeliefTwin
 from sb3_hds.errors import ParameterError
 from sb3_hds.sysid.belief.answers import Answer, Answers
-from sb3_hds.sysid.belief.belief import belief_of
-from sb3_hds.sysid.belief.handed_on import write_randomisation
-from sb3_hds.sysid.belief.plots import plot_belief
+from sb3_hds.sysid.belief.belief import belief_of, write_randomisation
+from sb3_hds.sysid.reporting.figures import plot_belief
 
 TWIN = twins.make("PendulumReal")
 UNION = TWIN.extend(effects.ViscousFriction(0), effects.ActionDelay(0))

@@ -15,7 +15,7 @@ from sb3_hds.core import Channel, State
 from sb3_hds.data import Finding
 from sb3_hds.effects import CoulombFriction
 from sb3_hds.errors import TrajectoryError
-from sb3_hds.sysid.checks.timing import in_step
+from sb3_hds.sysid.checks.timing import align_velocities
 
 pytestmark = pytest.mark.filterwarnings("ignore::sb3_hds.data.SamplingWarning")
 
@@ -550,7 +550,7 @@ def test_a_backward_difference_is_distinguished_from_steps_of_a_twin_and_shifted
     twin = twins.make("LinearAxis")
     differences = differentiated(measured(twin, n_steps=200, commands=force))
 
-    moved, words = in_step(twin, differences)
+    moved, words = align_velocities(twin, differences)
 
     assert "BackwardDifference" in kinds(audit(differences, twin=twin))
     # Without noise and without a twin, nobody knows.
@@ -561,7 +561,7 @@ def test_a_backward_difference_is_distinguished_from_steps_of_a_twin_and_shifted
     # A velocity that the twin computes in the same way stays.
     cart_pole = twins.make("CartPole")
     data = measured(cart_pole, n_steps=200)
-    assert in_step(cart_pole, data) == (data, ())
+    assert align_velocities(cart_pole, data) == (data, ())
 
 
 def test_a_position_and_a_velocity_that_are_swapped_are_refused_if_units_tell():

@@ -9,10 +9,11 @@ import pytest
 
 from sb3_hds import diagnose
 from sb3_hds.core import rollout
-from sb3_hds.sysid.estimation.calibrate import spread_of
+from sb3_hds.sysid.estimation.calibrate import channel_deviations
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
-from sb3_hds.sysid.estimation.shooting import motion_of, shots_of
+from sb3_hds.sysid.estimation.shooting import shots_of
+from sb3_hds.sysid.motion.joints import motion_of
 
 pytestmark = [
     pytest.mark.measured,
@@ -33,7 +34,9 @@ def error_over(twin, data, seconds):
     twin = twin.at_interval(data.dt, 1)
     hypotheses = Hypotheses.about(twin, (), ())
     shots, _ = shots_of(data, round(seconds / data.dt), twin)
-    evidence = Evidence(hypotheses, shots, spread_of(data), 1, portion=portion_for(shots.n))
+    evidence = Evidence(
+        hypotheses, shots, channel_deviations(data), 1, portion=portion_for(shots.n)
+    )
     return np.sqrt(np.mean(evidence.fit(hypotheses.null, (), n_steps=25).raw ** 2))
 
 

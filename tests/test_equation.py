@@ -10,20 +10,21 @@ import servo_leg
 from sb3_hds import Trajectories, diagnose, effects, twins
 from sb3_hds.core import rollout
 from sb3_hds.sysid.checks.conventions import other_convention
-from sb3_hds.sysid.checks.timing import in_step_with_the_log
-from sb3_hds.sysid.equation.columns import equation
-from sb3_hds.sysid.equation.effect_columns import lasting
-from sb3_hds.sysid.equation.motion import differences, kinematics, motion
+from sb3_hds.sysid.checks.timing import match_logged_integrator
+from sb3_hds.sysid.equation.assembly import equation
+from sb3_hds.sysid.equation.effect_columns import impulse_weights
 from sb3_hds.sysid.equation.screening import screen
-from sb3_hds.sysid.equation.smoothing import smooth, white_noise
 from sb3_hds.sysid.equation.terms import effective_inertia, terms
 from sb3_hds.sysid.equation.weak_form import weak_rows
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.motion.joints import differences, kinematics
+from sb3_hds.sysid.motion.motion import motion
+from sb3_hds.sysid.motion.smoothing import smooth, white_noise
 
 
 def proposed(twin, data, calibrate=()):
     """Sizes of the causes that are proposed, by key and short name."""
-    twin, data, _ = in_step_with_the_log(twin, data)
+    twin, data, _ = match_logged_integrator(twin, data)
     found = screen(twin, motion(twin, data), effects.ALL, calibrate)
     return {m.key: m.sizes for m in found.members}
 
@@ -119,7 +120,7 @@ def test_bumps_are_wide_where_velocities_are_noisy_and_narrow_where_something_el
         pull = lambda q, v: -3.0 * v + unknown * np.sin(6.0 * q)  # noqa: E731
         twin, data = rubbing_axis(noise=noise, pull=pull)
         known = Hypotheses.about(twin, (effects.ViscousFriction, effects.CoulombFriction), ())
-        [rows] = weak_rows(equation(known, motion(twin, data)))
+        rows = weak_rows(equation(known, motion(twin, data)), 0)
         return rows.narrowed
 
     assert narrowed(unknown=0.0, noise=1.0) == 1.0
@@ -178,7 +179,7 @@ def test_where_the_model_brakes_a_force_counts_the_more_the_later_it_acts(brakin
     met = braking / -np.expm1(-braking) if braking else 1.0
     places = np.linspace(0.0, 1.0, 2001)[None]
 
-    found = lasting(np.array([[[2.0]]]), np.array([[[2.0 * met]]]), 0, places)
+    found = impulse_weights(np.array([[[2.0]]]), np.array([[[2.0 * met]]]), 0, places)
 
     assert np.trapezoid(found, places)[0] == pytest.approx(1.0, abs=1e-5)
     assert found[0, -1] / found[0, 0] == pytest.approx(np.exp(braking), rel=1e-4)

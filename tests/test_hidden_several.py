@@ -17,9 +17,9 @@ from several_cases import SEVERAL, share_of_friction, visible
 from several_scores import score_case
 
 from sb3_hds import effects
-from sb3_hds.sysid.checks.timing import in_step_with_the_log
-from sb3_hds.sysid.equation.motion import motion
+from sb3_hds.sysid.checks.timing import match_logged_integrator
 from sb3_hds.sysid.equation.screening import screen
+from sb3_hds.sysid.motion.motion import motion
 
 VISCOUS, DRY = "viscous_friction.axis", "coulomb_friction.axis"
 
@@ -113,7 +113,7 @@ def test_sets_are_judged_cause_by_cause_and_name_by_name(said, named, right, fla
 
 @pytest.fixture(scope="module")
 def screened():
-    twin, data, _ = in_step_with_the_log(*first_users.joint_with_friction())
+    twin, data, _ = match_logged_integrator(*first_users.joint_with_friction())
     return screen(twin, motion(twin, data), effects.ALL, ())
 
 

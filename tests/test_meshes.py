@@ -9,8 +9,8 @@ from scipy.spatial import ConvexHull
 
 from sb3_hds import twins
 from sb3_hds.core import State
-from sb3_hds.sysid.reporting.film import section_of
-from sb3_hds.sysid.reporting.moving import moving_of
+from sb3_hds.sysid.reporting.animation import animate
+from sb3_hds.sysid.reporting.page import template
 from sb3_hds.sysid.reporting.pictures import replay_of
 
 BOX = np.array([[x, y, z] for x in (-0.1, 0.2) for y in (-0.05, 0.05) for z in (0.0, 0.5)])
@@ -68,8 +68,8 @@ def test_a_page_draws_them_and_a_saved_twin_keeps_them(twin):
     measured = 0.5 * np.sin(0.05 * np.arange(60)).reshape(2, 30, 1) * np.ones(2)
     replay = replay_of(measured, 0.3 * measured, 0.1 * measured, np.ones((30, 2)), 0.02)
 
-    moving = moving_of(again, again, replay)
+    moving = animate(again, again, replay)
 
     assert again == twin and moving.outlines.shape == (3, 60, 1, 20, 2)
     assert moving.outlines[0].min() >= 0.0 and moving.outlines[0].max() <= 100.0
-    assert section_of(moving).count("<polygon") == 3
+    assert template("animation.html").render(moving=moving.section()).count("<polygon") == 3

@@ -19,8 +19,8 @@ from independent_rigs import SYSTEMS, Planted, System, simulate
 
 from sb3_hds import Trajectories, diagnose, effects, twins
 from sb3_hds.core import Channel
-from sb3_hds.sysid.equation.motion import motion
 from sb3_hds.sysid.equation.screening import screen
+from sb3_hds.sysid.motion.motion import motion
 from sb3_hds.twins.rigs.linear_axis import LinearAxis
 
 # Of a size, by how much it may differ: what is not linear in a fit may end a little elsewhere. Of

@@ -9,8 +9,9 @@ from browser import in_chromium, needs_chromium
 from sb3_hds import twins
 from sb3_hds.core import State
 from sb3_hds.errors import ParameterError
-from sb3_hds.sysid.reporting.film import STYLE, check_film, section_of, write_film
-from sb3_hds.sysid.reporting.moving import moving_of
+from sb3_hds.sysid.reporting.animation import animate
+from sb3_hds.sysid.reporting.film import check_film, write_film
+from sb3_hds.sysid.reporting.page import template
 from sb3_hds.sysid.reporting.pictures import replay_of
 
 
@@ -26,7 +27,7 @@ def replayed(twin, n=2, rows=30):
 @pytest.fixture(scope="module")
 def moving():
     twin = twins.from_mujoco(robots.chain(3))
-    return moving_of(twin, twin, replayed(twin))
+    return animate(twin, twin, replayed(twin))
 
 
 def test_capsules_end_where_the_joints_of_the_model_are():
@@ -93,7 +94,9 @@ PLAY = """(page, done) => {
 @pytest.mark.parametrize("width", [400, 1200])
 def test_a_browser_plays_it(moving, width, tmp_path):
     meta = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-    page = f"<!DOCTYPE html>{meta}<style>{STYLE}</style>{section_of(moving)}"
+    style = template("animation.css").render()
+    section = template("animation.html").render(moving=moving.section())
+    page = f"<!DOCTYPE html>{meta}<style>{style}</style>{section}"
     assert "http" not in page.replace("http://www.w3.org", "")
 
     found, console = in_chromium(page, PLAY, width, tmp_path)

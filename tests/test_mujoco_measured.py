@@ -14,7 +14,7 @@ from sb3_hds import cli, effects, twins
 from sb3_hds.core import rollout
 from sb3_hds.data.columns import Columns
 from sb3_hds.data.reading import read_log
-from sb3_hds.sysid.equation.smoothing import smooth
+from sb3_hds.sysid.motion.smoothing import smooth
 
 pytestmark = [
     pytest.mark.measured,

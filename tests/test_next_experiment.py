@@ -23,7 +23,7 @@ from sb3_hds.sysid.belief.answers import Answer, Answers, factor_of, union
 from sb3_hds.sysid.belief.updated import updated
 from sb3_hds.sysid.design import Limits
 from sb3_hds.sysid.design.excitation import Excitation
-from sb3_hds.sysid.design.experiment import next_experiment, question
+from sb3_hds.sysid.design.experiment import design_problem, next_experiment
 from sb3_hds.sysid.design.result import Pair
 
 TWIN = twins.make("PendulumReal")
@@ -140,9 +140,11 @@ def test_evidence_is_what_the_wrong_answer_leaves_when_all_that_is_free_is_fitte
     n_steps, window = 30, 15
     actions = 1.5 * np.sin(0.4 * np.arange(n_steps))[None, :, None]
     asked = left_open(rubbing, dragging)
-    twin, numbers, _ = question(asked)
+    twin, numbers, _ = design_problem(asked)
     with jax.enable_x64(True):
-        found = Excitation(twin, Limits().at(twin), n_steps, window).told(actions, numbers).ratios
+        found = (
+            Excitation(twin, Limits().at(twin), n_steps, window).evaluate(actions, numbers).ratios
+        )
 
         def simulated(twin, params, state, k, count):
             run = rollout(twin, params, state, jnp.asarray(actions[0, k : k + count]))

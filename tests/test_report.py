@@ -14,7 +14,7 @@ from measuring import measured
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.errors import ParameterError
 from sb3_hds.sysid.diagnosis import findings as telling
-from sb3_hds.sysid.equation.friction import FrictionCurve
+from sb3_hds.sysid.equation.members import FrictionCurve
 from sb3_hds.sysid.reporting import figures as plots
 from sb3_hds.sysid.reporting.diagnosis import SENTENCES
 from sb3_hds.sysid.reporting.finding import Rejected

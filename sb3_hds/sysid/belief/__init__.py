@@ -1,1 +1,1 @@
-"""What the data leave open: the answers that they cannot tell apart, and a belief over them."""
+"""What the data leave open: the answers that they cannot distinguish, and a belief over them."""

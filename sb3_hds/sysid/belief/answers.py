@@ -12,9 +12,9 @@ from sb3_hds.core import Effect, ExtendedTwin, Parameter, Twin
 from sb3_hds.core.twin import layers_of
 from sb3_hds.effects import CoulombFriction, ViscousFriction
 
-# Standard deviation of a parameter of which the data say nothing, in units of its scale.
+# Standard deviation of a parameter that the data do not determine, in units of its scale.
 _UNKNOWN = 3.0
-# Weight from which an answer is the answer.
+# Weight from which the likeliest answer is settled.
 _SETTLED = 0.95
 
 
@@ -22,9 +22,9 @@ class Answer(NamedTuple):
     """
     One answer that the data leave open.
 
-    :param causes: keys of what is wrong by this answer, as ``"coulomb_friction.hinge"``; none: the
-        twin is right as it came
-    :param twin: as it came, with these causes in it, fitted to all data
+    :param causes: keys of the causes, as ``"coulomb_friction.hinge"``; none: the nominal model is
+        right
+    :param twin: nominal model with these causes, fitted to all data
     :param factor: by name of a parameter of ``twin``, a row of the matrix :math:`L` with which
         :math:`L L^T` is the joint covariance of all of them, in their units, shape ``(k,)``
     :param log_weight: logarithm of held-out likelihood and prior odds, up to a constant
@@ -44,15 +44,15 @@ class Answer(NamedTuple):
 @dataclasses.dataclass(frozen=True, eq=False)
 class Answers:
     """
-    The set of a diagnosis.
+    The answers of a diagnosis.
 
     :param answers: the likeliest first
-    :param noise: standard deviation of what the best answer leaves of each channel, shape
+    :param noise: standard deviation of each channel's residual under the best answer, shape
         ``(n_obs,)``
-    :param correlated: rows of these errors for each independent one; 1 for white noise
+    :param correlated: rows of these residuals for each independent one; 1 for white noise
     :param window: length of the windows in which answers were compared, in steps of the twin
-    :param start: observation from which a recording may begin: the slowest beginning of those
-        there are, shape ``(n_obs,)``
+    :param start: observation from which a recording may begin: the slowest start of the recordings,
+        shape ``(n_obs,)``
     """
 
     answers: tuple[Answer, ...]
@@ -63,7 +63,7 @@ class Answers:
 
     @property
     def weights(self) -> Float[np.ndarray, " answers"]:
-        """Of the answers, with the sum one."""
+        """Normalised weights of the answers."""
         logs = np.array([answer.log_weight for answer in self.answers])
         weights = np.exp(logs - logs.max())
         return weights / weights.sum()
@@ -89,8 +89,7 @@ class Answers:
 
 def union(answers: Sequence[Answer]) -> tuple[Twin, np.ndarray, np.ndarray]:
     """
-    One twin that has the effects of all answers: what an answer does not have stands at the value
-    at which it vanishes.
+    One twin with the effects of all answers: those that an answer does not have are at their null.
 
     :param answers: whose twins extend the same twin
     :return: that twin with the values of the first answer; parameters of each answer in the order
@@ -117,6 +116,12 @@ def union(answers: Sequence[Answer]) -> tuple[Twin, np.ndarray, np.ndarray]:
     return twin, values, factor
 
 
+def bounds_of(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
+    """:return: smallest and largest values of all parameters, each of shape ``(p,)``"""
+    parameters = twin.parameters.values()
+    return np.array([p.lower for p in parameters]), np.array([p.upper for p in parameters])
+
+
 def effects_of(twin: Twin) -> tuple[Effect, ...]:
     """:return: the effects that are attached, holding their values"""
     extended = (layer for layer in layers_of(twin) if isinstance(layer, ExtendedTwin))
@@ -124,14 +129,14 @@ def effects_of(twin: Twin) -> tuple[Effect, ...]:
 
 
 def effect_key(effect: Effect) -> str:
-    """:return: name and place of an effect that names its place, as attached ones do"""
+    """:return: name and place of an attached effect"""
     return f"{effect.name}.{effect.where}"
 
 
 def everything_open(twin: Twin) -> Answer:
     """
-    :return: this twin, with friction of size zero at each joint, as an answer of which nothing is
-        known but the scales of its parameters; what is known exactly is left out
+    :return: this twin, with friction of size zero at each joint, as an answer whose parameters are
+        uncertain by their scales, apart from the known ones
     """
     there = {effect_key(effect) for effect in effects_of(twin)}
     friction = [
@@ -147,7 +152,7 @@ def everything_open(twin: Twin) -> Answer:
 
 
 def _scale_of(parameter: Parameter) -> float:
-    """Within bounds that are narrower than the scale, their distance."""
+    """:return: the parameter's scale, or the distance of its bounds if that is smaller"""
     width = parameter.upper - parameter.lower
     return min(parameter.scale, width) if math.isfinite(width) else parameter.scale
 
@@ -164,5 +169,5 @@ def factor_of(covariance: Float[np.ndarray, "k k"], scale: Float[np.ndarray, " k
     scaled = np.where(np.logical_or.outer(unknown, unknown), 0.0, scaled)
     scaled[unknown, unknown] = _UNKNOWN**2
     power, directions = np.linalg.eigh(0.5 * (scaled + scaled.T))
-    spread = np.sqrt(np.clip(power, 0.0, _UNKNOWN**2))
-    return scale[:, None] * directions * spread
+    deviations = np.sqrt(np.clip(power, 0.0, _UNKNOWN**2))
+    return scale[:, None] * directions * deviations

@@ -1,4 +1,4 @@
-"""Which answers a search leaves open, each fitted to all data, with its weight and covariance."""
+"""The answers that a search leaves open, fitted to all data, with weights and covariances."""
 
 from collections.abc import Callable, Sequence
 
@@ -18,19 +18,19 @@ from sb3_hds.sysid.equation.plausibility import rarity_of
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
 
-#: most answers that are kept, the likeliest ones
+#: largest number of answers, the likeliest ones
 MOST = 6
-# Steps of a window where no motion says how long it should be.
+# Steps of a window where no motion was measured from which to choose it.
 _WINDOW = 20
-# Candidates that stand for what has no name.
+# Number of candidates that stand in for an unexplained residual.
 _NEAREST = 3
-# Directions below this share of the largest curvature do not move.
+# Directions below this share of the largest curvature are ignored.
 _RANK = 1e-10
-# Step by which the twin's parameters are asked how they follow a candidate's, in typical
-# deviations: they are linear in it.
+# Step of the difference by which the twin's parameters follow a candidate's, in typical deviations:
+# they are linear in it.
 _STEP = 1e-4
 
-#: keys of causes and all parameters -> the twin as it came with these causes
+#: keys of causes and all parameters -> the nominal model with these causes
 Extended = Callable[[Sequence[str], np.ndarray], Twin]
 
 
@@ -45,13 +45,13 @@ def open_answers(
     unexplained: str = "",
 ) -> Answers:
     """
-    The causes as they were found; for each alternative of one of them, that in its place; and where
-    something has no name, what comes nearest beside them. Each is fitted to all data, and weighed
-    by its likelihood on held-out recordings and by its prior odds.
+    The causes that were found; the same with each alternative in place of its cause; and, if a
+    residual is unexplained, the same with each of the nearest candidates added. Each is fitted to
+    all data, and weighted by its likelihood on held-out recordings and its prior odds.
 
     :param found: causes
     :param rejected: candidates that were not accepted, the nearest first
-    :param base: what is believed with the causes
+    :param base: fit of the causes
     :param extended: makes the twin of an answer
     :param data: of the same interval as the windows
     :param every: steps of the twin in one of the windows
@@ -95,7 +95,7 @@ def open_answers(
 
 def nothing_known(twin: Twin, noise: Float[np.ndarray, " obs"], data: Trajectories) -> Answers:
     """
-    Where data told nothing, everything is open.
+    The answer of data that determine nothing.
 
     :param noise: standard deviation of each channel's errors
     """
@@ -115,7 +115,10 @@ def _answer(
     if not base.free:
         return Answer(keys, twin, {}, float(log_weight))
     covariance = joint_covariance(every, point, base.free)
-    factor = factor_of(covariance, _typical(search, point.theta)[list(base.free)])
+    # Typical deviations: the declared one, the smallest that these data show, or what was found.
+    declared = np.array([h.parameter(name).scale for name in h.names])
+    typical = np.maximum(np.maximum(declared, h.scale), np.abs(point.theta - h.null))
+    factor = factor_of(covariance, typical[list(base.free)])
     rows: dict[str, np.ndarray] = {}
     for row, i in zip(factor, base.free, strict=True):
         inward = -1.0 if point.theta[i] + _STEP * h.scale[i] > h.upper[i] else 1.0
@@ -129,16 +132,6 @@ def _answer(
     return Answer(keys, twin, rows, float(log_weight))
 
 
-def _typical(search: Search, theta: np.ndarray) -> np.ndarray:
-    """
-    :return: what a parameter may well be off by: its declared deviation, what these data would just
-        show, or as much as was found
-    """
-    h = search.hypotheses
-    declared = np.array([h.parameter(name).scale for name in h.names])
-    return np.maximum(np.maximum(declared, h.scale), np.abs(theta - h.null))
-
-
 def joint_covariance(half: Half, point: Point, free: Sequence[int]) -> np.ndarray:
     """
     :param free: indices of what was fitted
@@ -148,7 +141,7 @@ def joint_covariance(half: Half, point: Point, free: Sequence[int]) -> np.ndarra
     scale = half.evidence.hypotheses.scale[list(free)]
     slopes = half.evidence.slopes(point, free)
     covariance = jackknife(slopes, half.cluster)
-    # Fewer units than parameters leave directions in which nothing was left out.
+    # With fewer clusters than parameters, the jackknife covers only some directions.
     if np.isfinite(covariance).all() and len(np.unique(half.cluster)) <= len(free):
         total = slopes.curvature.sum(0)
         covariance = covariance + np.linalg.pinv(total, rcond=_RANK, hermitian=True)

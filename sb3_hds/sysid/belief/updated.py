@@ -1,10 +1,10 @@
 r"""
-What a new recording says of answers that earlier data left open.
+Bayesian update of the answers that earlier data left open, by new recordings.
 
 Answer :math:`m` predicts it in windows, each from a start state :math:`x_k` of its own, with
-parameters :math:`\theta_m + L_m z`, of which the earlier data say that :math:`z` is standard
-normal. Its likelihood is that of the best :math:`z` and :math:`x`, times the volume of the
-:math:`z` that do nearly as well (Laplace's approximation):
+parameters :math:`\theta_m + L_m z`; given the earlier data, :math:`z` is standard normal. Its
+likelihood is that of the best :math:`z` and :math:`x`, times the volume of nearly as good
+:math:`z` (Laplace's approximation):
 
 .. math::
    -2 \log p_m = \min_{z, x} \frac{1}{c} \sum_k \left\| \frac{y_m(z, x_k) - y}{\sigma} \right\|^2
@@ -16,7 +16,6 @@ number of rows for each independent one.
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,38 +25,24 @@ from jaxtyping import Array
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.trajectories.episodes import same_interval
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.belief.answers import Answer, Answers, union
+from sb3_hds.sysid.belief.answers import Answer, Answers, bounds_of, union
 from sb3_hds.sysid.estimation.shooting import (
     Shots,
+    eliminate_start,
     n_free,
     shots_of,
     simulate,
-    solve_normal,
     with_slopes,
 )
 
-# Gauss-Newton steps, and errors beyond which one counts in proportion, in units of the noise.
+# Gauss-Newton steps, and the threshold of Huber's loss, in units of the noise.
 _STEPS, _HUBER = 8, 3.0
 
 
-class _Fitted(NamedTuple):
-    """
-    :param cost: twice the negative logarithm of the likelihood, without the volume
-    :param z: parameters in units of their deviations, shape ``(k,)``
-    :param curvature: :math:`H`, shape ``(k, k)``
-    """
-
-    cost: Array
-    z: Array
-    curvature: Array
-
-
-def updated(answers: Answers, data: Trajectories, window: int | None = None) -> Answers:
+def updated(answers: Answers, data: Trajectories) -> Answers:
     """
     :param answers: that earlier data left open
     :param data: recorded since, sampled at the interval of the twins
-    :param window: steps of the windows; default: those of the answers, fewer where recordings are
-        shorter
     :return: the same answers, their weights and parameters as all data have them, likeliest first
     :raises CalibrationError: for other channels or another interval than the twin's
     :raises TrajectoryError: if no recording is long enough
@@ -70,20 +55,21 @@ def updated(answers: Answers, data: Trajectories, window: int | None = None) -> 
             f"{len(twin.actuators)} commands; the recordings have {data.n_obs} and {data.n_act}, "
             f"every {data.dt:g} s. Choose the columns, or resample: data.resample(dt={twin.dt:g})."
         )
-    length = min(window or answers.window, int(data.lengths.max()))
+    length = min(answers.window, int(data.lengths.max()))
     shots, _ = shots_of(data, length, twin)
-    low = np.array([p.lower for p in twin.parameters.values()])
-    high = np.array([p.upper for p in twin.parameters.values()])
+    low, high = bounds_of(twin)
     with jax.enable_x64(True):
         fit = jax.jit(partial(_fitted, twin, shots, answers.noise, answers.correlated))
         fitted = [jax.tree.map(np.asarray, fit(*one)) for one in zip(values, factor, strict=True)]
     found = []
-    for answer, value, own, one in zip(answers.answers, values, factor, fitted, strict=True):
-        theta = np.clip(value + own @ one.z, low, high)
-        spread = np.linalg.cholesky(np.linalg.inv(one.curvature))
-        cost = float(one.cost) + float(np.linalg.slogdet(one.curvature)[1])
+    for answer, value, own, (cost, z, curvature) in zip(
+        answers.answers, values, factor, fitted, strict=True
+    ):
+        theta = np.clip(value + own @ z, low, high)
+        narrower = np.linalg.cholesky(np.linalg.inv(curvature))
+        cost = float(cost) + float(np.linalg.slogdet(curvature)[1])
         cost = cost if np.isfinite(cost) else np.inf
-        found.append(_answer(answer, twin, theta, own @ spread, answer.log_weight - 0.5 * cost))
+        found.append(_answer(answer, twin, theta, own @ narrower, answer.log_weight - 0.5 * cost))
     found.sort(key=lambda answer: -answer.log_weight)
     return dataclasses.replace(answers, answers=tuple(found))
 
@@ -99,25 +85,25 @@ def _answer(
 
 def _fitted(
     twin: Twin, shots: Shots, noise: np.ndarray, correlated: float, values: Array, factor: Array
-) -> _Fitted:
+) -> tuple[Array, Array, Array]:
+    """
+    :return: twice the negative logarithm of the likelihood, without the volume; parameters in units
+        of their deviations, shape ``(k,)``; and :math:`H`, shape ``(k, k)``
+    """
     names, n_z, n_x = tuple(twin.parameters), factor.shape[1], n_free(twin)
 
     def errors(shot: Shots, both: Array) -> Array:
         vector = values + factor @ both[:n_z]
         params = {name: vector[i] for i, name in enumerate(names)} | dict(twin.tensors)
         missed = (simulate(twin, params, shot, both[n_z:]) - shot.obs) / noise
-        # Large errors count in proportion: a simulation that is a little off is not that unlikely.
+        # Huber's loss: small errors of the model must not decide.
         size = jnp.abs(missed)
         far = jnp.sqrt(_HUBER * (2.0 * jnp.maximum(size, _HUBER) - _HUBER))
         return jnp.where(size > _HUBER, jnp.sign(missed) * far, missed).ravel()
 
     def window(shot: Shots, x: Array, z: Array) -> tuple[Array, ...]:
         now, slopes = with_slopes(partial(errors, shot), jnp.concatenate([z, x]))
-        by_z, by_x = slopes[:, :n_z], slopes[:, n_z:]
-        both = jnp.concatenate([now[:, None], by_z], 1)
-        moves = jax.vmap(partial(solve_normal, by_x), 1, 1)(both)
-        free = both - by_x @ moves
-        own, along = free[:, 0], free[:, 1:]
+        own, along, moves = eliminate_start(now, slopes, n_z)
         return now @ now, along.T @ own, along.T @ along, moves
 
     def normal(z: Array, x: Array) -> tuple[Array, Array, Array, Array]:
@@ -139,4 +125,4 @@ def _fitted(
     start = jnp.zeros(n_z), jnp.zeros((shots.n, n_x))
     z, x = jax.lax.fori_loop(0, _STEPS, improve, start)
     cost, _, curvature, _ = normal(z, x)
-    return _Fitted(cost, z, curvature)
+    return cost, z, curvature

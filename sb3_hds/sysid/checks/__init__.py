@@ -1,1 +1,1 @@
-"""What is asked of a log before and beside any cause: its conventions, its clock, its constancy."""
+"""Checks of a log and a model: conventions, timing, adequacy, and stability of parameters."""

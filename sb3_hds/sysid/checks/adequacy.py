@@ -23,25 +23,26 @@ class Distance(NamedTuple):
 
     :param channel: name and unit
     :param error: root mean square [channel's unit]
-    :param noise: of the sensor, estimated from fourth differences of its samples, likewise
-    :param spread: standard deviation of the measurements, likewise
+    :param noise: standard deviation of the sensor's noise, from fourth differences of its samples
+        [channel's unit]
+    :param deviation: standard deviation of the measurements [channel's unit]
     """
 
     channel: Channel
     error: float
     noise: float
-    spread: float
+    deviation: float
 
     @property
     def near(self) -> bool:
         """Whether the model predicts this channel to near its noise."""
-        return self.error <= max(_NEAR * self.noise, _SMALL * self.spread)
+        return self.error <= max(_NEAR * self.noise, _SMALL * self.deviation)
 
     def __str__(self) -> str:
         unit = f" {self.channel.unit}" if self.channel.unit else ""
         return (
-            f"{self.channel.name} by {self.error:.3g}{unit}, {self.error / self.spread:.0%} of its "
-            f"standard deviation (the noise is about {self.noise:.2g}{unit})"
+            f"{self.channel.name} by {self.error:.3g}{unit}, {self.error / self.deviation:.0%} of "
+            f"its standard deviation (the noise is about {self.noise:.2g}{unit})"
         )
 
 
@@ -62,17 +63,17 @@ def distances(
     channels: Sequence[Channel],
     raw: Float[np.ndarray, "n rows obs"],
     noise: Float[np.ndarray, " obs"],
-    spread: Float[np.ndarray, " obs"],
+    deviations: Float[np.ndarray, " obs"],
 ) -> tuple[Distance, ...]:
     """
     :param raw: simulated minus measured
     :param noise: of each channel
-    :param spread: standard deviation of each channel
+    :param deviations: standard deviation of each channel
     """
     errors = np.sqrt(np.mean(np.minimum(np.nan_to_num(raw**2, nan=np.inf), 1e6), axis=(0, 1)))
     return tuple(
         Distance(channel, float(e), float(n), float(s))
-        for channel, e, n, s in zip(channels, errors, noise, spread, strict=True)
+        for channel, e, n, s in zip(channels, errors, noise, deviations, strict=True)
     )
 
 

@@ -1,10 +1,11 @@
 """
 Is a log written in the model's conventions? Zeros, directions, units and the order of columns are
-tried before any cause: a wrong one is imitated by several right ones.
+checked before any cause is looked for: a wrong convention resembles several causes at once.
 """
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,20 +13,17 @@ import numpy as np
 from sb3_hds.core import AnalyticTwin, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ConstantForce, CoulombFriction, ViscousFriction
-from sb3_hds.sysid.equation.columns import equation
-from sb3_hds.sysid.equation.motion import Motion, Moved
-from sb3_hds.sysid.equation.screening import problem
-from sb3_hds.sysid.equation.weak_form import grams, weak_rows
+from sb3_hds.sysid.equation.assembly import equation, problem
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.motion.motion import JointMotion, Motion
 
-# What nearly every machine has, whatever is wrong with its log.
+# Effects that nearly every machine has, whatever the conventions of its log.
 _ALWAYS = (ViscousFriction, CoulombFriction, ConstantForce)
-# Rows that such a test needs, at most; on fewer, all changes are ranked, and the likeliest tested.
+# Rows of the test, at most; all changes are ranked on fewer, and only the likeliest are tested.
 _ROWS, _FEW_ROWS, _LIKELIEST = 3000, 1000, 4
-# By which factor what is left, in units of the noise, has to be smaller, and what that has to be
-# worth in -2 log likelihood.
+# A change is accepted if it lowers the residual by this factor, and -2 log likelihood by this much.
 _SMALLER, _WORTH = 2.0, 30.0
-# What is left near the noise needs no other convention.
+# Residuals below this multiple of the noise need no other convention.
 _FINE = 2.0
 
 
@@ -33,7 +31,7 @@ class Convention(NamedTuple):
     """
     :param key: kind and place: ``"direction.hinge"``
     :param words: sentences on what differs, and on what to write into the map of columns
-    :param before: what the equation of motion leaves of the log as it is, in units of the noise
+    :param before: residual of the equation of motion with the log as it is, in units of the noise
     :param after: the same with the convention changed
     """
 
@@ -44,13 +42,23 @@ class Convention(NamedTuple):
 
 
 class _Change(NamedTuple):
+    """
+    Another convention in which a log may be written.
+
+    :param words: sentences on what differs, and on what to write into the map of columns
+    :param q: what the positions become
+    :param slopes: what velocities and accelerations become
+    :param actions: what the commands become
+    :param scale: of each joint's units, or of all
+    """
+
     name: str
     places: tuple[str, ...]
     words: str
-    q: Callable[[np.ndarray], np.ndarray]
-    slopes: Callable[[np.ndarray], np.ndarray]
-    actions: Callable[[np.ndarray], np.ndarray]
-    scale: np.ndarray
+    q: Callable[[np.ndarray], np.ndarray] = np.asarray
+    slopes: Callable[[np.ndarray], np.ndarray] = np.asarray
+    actions: Callable[[np.ndarray], np.ndarray] = np.asarray
+    scale: np.ndarray | float = 1.0
 
 
 def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Convention | None:
@@ -58,9 +66,9 @@ def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Co
     :param twin: nominal model
     :param motion: as measured
     :param nuisances: parameters that are refitted
-    :return: the one change of the whole log under which the equation of motion, with friction and
-        an offset at every joint, leaves far less in units of the sensors' noise; None if there is
-        none, or if the log fits as it is
+    :return: the change of convention under which the residual of the equation of motion, with
+        friction and an offset at every joint, is far smaller; None if there is none, or if the log
+        fits as it is
     """
     if not isinstance(plant_of(twin), AnalyticTwin) or not motion.moves.any():
         return None
@@ -68,12 +76,12 @@ def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Co
     coarse = motion.twin(twin)
     speeds = tuple(motion.speed)
     hypotheses = Hypotheses.about(coarse, _ALWAYS, nuisances, only=_keys(coarse), speeds=speeds)
-    weight, now = _left(hypotheses, motion)
+    weight, now = _residual(hypotheses, motion)
     if np.all(now < _FINE):
         return None
-    changes = list(_changes(twin, motion))
+    changes = list(_changes(twin))
     if (few := _fewer(motion, _FEW_ROWS)) is not motion:
-        likely = _by_gain(hypotheses, few, changes, *_left(hypotheses, few))[:_LIKELIEST]
+        likely = _by_gain(hypotheses, few, changes, *_residual(hypotheses, few))[:_LIKELIEST]
         changes = [change for _, change, _ in likely]
     ranked = _by_gain(hypotheses, motion, changes, weight, now)
     if not ranked:
@@ -94,38 +102,38 @@ def _by_gain(
 ) -> list[tuple[float, _Change, np.ndarray]]:
     """
     :param weight: independent rows of each joint
-    :param now: what is left of the log as it is
-    :return: gain in -2 log likelihood, the change, and what is left under it, best first
+    :param now: residual of each joint with the log as it is, in units of the noise
+    :return: gain in -2 log likelihood, the change, and the residuals under it, best first
     """
     found = []
     for change in changes:
-        _, then = _left(hypotheses, _changed(motion, change))
+        _, then = _residual(hypotheses, _changed(motion, change))
         if np.isfinite(then).all():
             ratio = np.maximum(now, 1.0) / np.maximum(then, 1.0)
             found.append((float(weight @ (2.0 * np.log(ratio))), change, then))
     return sorted(found, key=lambda one: -one[0])
 
 
-def what_friction_leaves(twin: Twin, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+def residual_beside_friction(twin: Twin, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """
-    :return: independent rows of each joint, and what friction and an offset leave of its equation
-        of motion, in units of the noise
+    :return: independent rows of each joint, and the residual of its equation of motion with
+        friction and an offset, in units of the noise
     """
     motion = _fewer(motion)
     known = Hypotheses.about(
         motion.twin(twin), _ALWAYS, (), only=_keys(twin), speeds=tuple(motion.speed)
     )
-    return _left(known, motion)
+    return _residual(known, motion)
 
 
 def _keys(twin: Twin) -> set[str]:
     return {f"{kind.name}.{joint.name}" for kind in _ALWAYS for joint in twin.joints}
 
 
-def _left(hypotheses: Hypotheses, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """:return: independent rows, and what is left in units of the noise, of each joint"""
+def _residual(hypotheses: Hypotheses, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """:return: independent rows of each joint, and its residual in units of the noise"""
     made = equation(hypotheses, motion, quick=True)
-    p = problem(hypotheses, made, grams(made, weak_rows(made)))
+    p = problem(hypotheses, made)
     keys = list(range(len(p.items)))
     found = p.solve(keys)
     rss = p.by_joint(found.weights, p.grams.by_joint)
@@ -133,110 +141,61 @@ def _left(hypotheses: Hypotheses, motion: Motion) -> tuple[np.ndarray, np.ndarra
     return p.grams.effective, np.sqrt(rss / p.grams.effective) / floor
 
 
-def _changes(twin: Twin, motion: Motion) -> Iterator[_Change]:
-    dof, n_act = len(twin.joints), len(twin.actuators)
-    same = lambda x: x  # noqa: E731
-    one = np.ones(dof)
-    names = [joint.name for joint in twin.joints]
-    rotary = np.array([joint.unit == "rad" for joint in twin.joints])
+def _changes(twin: Twin) -> Iterator[_Change]:
+    joints, actuators = twin.joints, twin.actuators
+    dof, n_act = len(joints), len(actuators)
+    rotary = np.array([joint.unit == "rad" for joint in joints])
     for j in np.flatnonzero(rotary):
-        ahead = np.pi * np.eye(dof)[j]
-        yield _Change(
-            "zero",
-            (names[j],),
-            f"{names[j]} is counted from a zero that is half a turn from the model's: write its "
-            "column with offset: 3.14159265, or give the model that zero.",
-            lambda q, ahead=ahead: q + ahead,
-            same,
-            same,
-            one,
+        name = joints[j].name
+        words = (
+            f"{name} is counted from a zero that is half a turn from the model's: write its column "
+            "with offset: 3.14159265, or give the model that zero."
         )
-    for j in range(dof):
-        side = one - 2.0 * np.eye(dof)[j]
-        yield _Change(
-            "direction",
-            (names[j],),
-            f"{names[j]} is counted the other way round: write its columns with scale: -1.",
-            lambda q, side=side: q * side,
-            lambda x, side=side: x * side,
-            same,
-            one,
-        )
-    for i in range(n_act):
-        side = np.ones(n_act) - 2.0 * np.eye(n_act)[i]
-        yield _Change(
-            "command",
-            (twin.actuators[i].name,),
-            f"The command {twin.actuators[i].name} has the wrong sign: write its column with "
-            "scale: -1.",
-            same,
-            same,
-            lambda u, side=side: u * side,
-            one,
-        )
+        yield _Change("zero", (name,), words, q=partial(np.add, np.pi * np.eye(dof)[j]))
+    for j, joint in enumerate(joints):
+        turned = partial(np.multiply, 1.0 - 2.0 * np.eye(dof)[j])
+        words = f"{joint.name} is counted the other way round: write its columns with scale: -1."
+        yield _Change("direction", (joint.name,), words, q=turned, slopes=turned)
+    for i, actuator in enumerate(actuators):
+        turned = partial(np.multiply, 1.0 - 2.0 * np.eye(n_act)[i])
+        words = f"The command {actuator.name} has the wrong sign: write its column with scale: -1."
+        yield _Change("command", (actuator.name,), words, actions=turned)
     if n_act > 1:
-        yield _Change(
-            "command",
-            (),
-            "All commands have the wrong sign: write their columns with scale: -1.",
-            same,
-            same,
-            lambda u: -u,
-            one,
-        )
+        words = "All commands have the wrong sign: write their columns with scale: -1."
+        yield _Change("command", (), words, actions=np.negative)
     if rotary.any():
         size = np.where(rotary, np.pi / 180.0, 1.0)
-        yield _Change(
-            "degrees",
-            (),
-            "Angles are in degrees: write their columns with unit: deg.",
-            lambda q: q * size,
-            lambda x: x * size,
-            same,
-            size,
-        )
+        smaller = partial(np.multiply, size)
+        words = "Angles are in degrees: write their columns with unit: deg."
+        yield _Change("degrees", (), words, q=smaller, slopes=smaller, scale=size)
     for i, j in itertools.combinations(range(dof), 2):
-        if twin.joints[i].unit != twin.joints[j].unit:
-            continue
-        order = np.arange(dof)
-        order[[i, j]] = j, i
-        yield _Change(
-            "order",
-            (names[i], names[j]),
-            f"The columns of {names[i]} and {names[j]} are exchanged: exchange them in the map.",
-            lambda q, order=order: q[:, order],
-            lambda x, order=order: x[:, order],
-            same,
-            one,
-        )
+        if joints[i].unit == joints[j].unit:
+            one, other = joints[i].name, joints[j].name
+            words = f"The columns of {one} and {other} are exchanged: exchange them in the map."
+            swap = _swap(dof, i, j)
+            yield _Change("order", (one, other), words, q=swap, slopes=swap)
     for i, j in itertools.combinations(range(n_act), 2):
-        order = np.arange(n_act)
-        order[[i, j]] = j, i
-        yield _Change(
-            "order",
-            (twin.actuators[i].name, twin.actuators[j].name),
-            f"The commands {twin.actuators[i].name} and {twin.actuators[j].name} are exchanged: "
-            "exchange their columns in the map.",
-            same,
-            same,
-            lambda u, order=order: u[:, order],
-            one,
-        )
+        one, other = actuators[i].name, actuators[j].name
+        words = f"The commands {one} and {other} are exchanged: exchange their columns in the map."
+        yield _Change("order", (one, other), words, actions=_swap(n_act, i, j))
+
+
+def _swap(n: int, i: int, j: int) -> Callable[[np.ndarray], np.ndarray]:
+    order = np.arange(n)
+    order[[i, j]] = j, i
+    return lambda x: x[:, order]
 
 
 def _changed(motion: Motion, change: _Change) -> Motion:
     recordings = tuple(
-        Moved(
-            change.q(r.q),
-            change.slopes(r.v),
-            change.slopes(r.a),
-            change.slopes(r.raw),
-            change.actions(r.actions),
+        JointMotion(
+            change.q(r.q), *map(change.slopes, (r.v, r.a, r.raw)), change.actions(r.actions)
         )
         for r in motion.recordings
     )
-    order = change.slopes(np.arange(1.0, len(motion.noise_q) + 1.0)[None] / change.scale)[0]
-    places = np.round(np.abs(order)).astype(int) - 1 if change.name == "order" else slice(None)
+    places = np.arange(len(motion.noise_q))
+    if change.name == "order":
+        places = change.slopes(places[None])[0]
     return motion._replace(
         recordings=recordings,
         noise_q=(motion.noise_q * change.scale)[places],
@@ -248,7 +207,7 @@ def _changed(motion: Motion, change: _Change) -> Motion:
 
 
 def _fewer(motion: Motion, most: int = _ROWS) -> Motion:
-    """Stretches of each recording, so many rows in all."""
+    """The beginning of each recording, about ``most`` rows in all."""
     n = sum(len(r.actions) for r in motion.recordings)
     if n <= most:
         return motion
@@ -256,5 +215,5 @@ def _fewer(motion: Motion, most: int = _ROWS) -> Motion:
     for r in motion.recordings:
         rows = max(int(len(r.actions) * most / n), min(len(r.actions), 50))
         q, v, a, raw = (x[: rows + 1] for x in r[:4])
-        kept.append(Moved(q, v, a, raw, r.actions[:rows]))
+        kept.append(JointMotion(q, v, a, raw, r.actions[:rows]))
     return motion._replace(recordings=tuple(kept))

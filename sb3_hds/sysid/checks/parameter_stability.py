@@ -11,10 +11,10 @@ from sb3_hds.sysid.comparison.unexplained import MissingForce, ShortWindows
 
 # Waves over the ranks of a quantity with which a size may change, and the level at which it does.
 _WAVES, _LEVEL = 4, 0.01
-# By which factor that level is stricter, because windows of one recording are not independent.
+# Factor by which p-values are larger, because windows of one recording are not independent.
 _STRICTER = 25.0
-# Directions below this share of the largest curvature do not move; of what all windows know, the
-# share that others than one know at least.
+# Directions below this share of the largest curvature are ignored; least share of the information
+# that remains when one window is left out.
 _RANK, _LEAST_OF_OTHERS = 1e-10, 1e-9
 
 
@@ -40,7 +40,7 @@ def change(
     is that of the windows' slopes where the :math:`c_k` are fitted, so that the change itself does
     not count as noise, each window left out of its own fit; the F distribution knows how many
     windows tell of the change. A cause that is merely the nearest name, as dry friction is for
-    one that depends on position, fails this long before what it leaves can be told from noise.
+    one that depends on position, fails this test long before its residual is detectable.
 
     Source: Hansen, *Testing for parameter instability in linear models*, J. Policy Modeling 14(4),
     1992; Zeileis and Hornik, *Generalized M-fluctuation tests for parameter instability*,
@@ -80,7 +80,7 @@ def _tested(
     follows = whole @ cross
     free = np.linalg.pinv(inner - cross.T @ follows, rcond=_RANK, hermitian=True)
 
-    # How the waves, and what was fitted in their stead, move each window's scores.
+    # How each window's scores change with the waves, the fitted parameters compensating.
     moves = np.zeros((*waves.shape, curvature.shape[1]))
     moves[:, :, at] = waves
     moves -= follows.T
@@ -95,14 +95,14 @@ def _tested(
     others = (1.0 + _LEAST_OF_OTHERS) * np.eye(waves.shape[1]) - left_out
     noise = np.linalg.solve(others, by_window(then)[..., None])[..., 0]
     statistic = float(slope @ np.linalg.pinv(noise.T @ noise, rcond=_RANK, hermitian=True) @ slope)
-    # Waves gain by chance, too: as much as they gain of the statistic.
+    # Part of the gain is due to noise: as much as the waves gain of the statistic.
     n_waves, gained = waves.shape[1], float(slope @ free @ slope)
     real = max(1.0 - n_waves / statistic, 0.0) if statistic else 0.0
-    # So many windows of equal weight would know as much of the waves as these.
+    # Number of windows of equal weight that would determine the waves as well.
     weight = np.einsum("nkk->n", left_out)
     equal = np.sum(weight) ** 2 / max(np.sum(weight**2), 1e-300)
     p_value = float(scipy.stats.f.sf(statistic / n_waves, n_waves, max(equal - n_waves, 1.0)))
-    # Windows may scatter less than the noise says, part of which are errors that nobody minds.
+    # Windows may scatter less than the noise, which contains a region of practical equivalence.
     p_value = max(p_value, float(scipy.stats.chi2.sf(gained, n_waves)))
     return _Tested(p_value, 0.5 * real * gained)
 

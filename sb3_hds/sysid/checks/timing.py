@@ -1,4 +1,4 @@
-"""When each column of a log was sampled: late velocities, and those of leapfrog integrators."""
+"""When the columns of a log were sampled: delayed velocities, and those of leapfrog integrators."""
 
 import copy
 import dataclasses
@@ -16,29 +16,29 @@ from sb3_hds.core import (
     semi_implicit_euler,
 )
 from sb3_hds.core.numerics.integrators import Integrator
-from sb3_hds.core.twin import layers_of, plant_of
+from sb3_hds.core.twin import layers_of
 from sb3_hds.data.audit.results import shifted
 from sb3_hds.data.audit.velocity import VelocityPair, best_pairs, velocity_pairs
-from sb3_hds.sysid.checks.conventions import what_friction_leaves
-from sb3_hds.sysid.equation.motion import joint_motion, kinematics, lag_of, motion
-from sb3_hds.sysid.estimation.candidates import encoders
+from sb3_hds.sysid.checks.conventions import residual_beside_friction
+from sb3_hds.sysid.motion.joints import encoders, joint_motion, kinematics, lag_of
+from sb3_hds.sysid.motion.motion import motion
 
-# Longest shift that is taken for a matter of computation [samples], [s], and the least that counts.
+# Longest shift that is attributed to computation [samples], [s], and the least that counts.
 _SAMPLES, _SECONDS, _VISIBLE = 1.0, 2e-3, 0.1
 _SIGMAS = 3.0
-# Of each recording, and of them, to see what the twin's own velocities do.
+# Steps of each recording, and recordings, that are simulated to time the twin's own velocities.
 _STEPS, _RECORDINGS = 1000, 4
-# Velocities that are true half an interval before their positions, give or take so much.
+# Velocities that are true half an interval before their positions, and the tolerance.
 _HALF, _ABOUT = -0.5, 0.1
 
 
-def in_step(twin: Twin, data: Trajectories) -> tuple[Trajectories, tuple[str, ...]]:
+def align_velocities(twin: Twin, data: Trajectories) -> tuple[Trajectories, tuple[str, ...]]:
     """
-    Velocities moved to where those of the twin are, relative to its positions.
+    Shift measured velocities to the instants at which the twin reports its own.
 
-    A rig that differentiates and filters its encoders reports velocities late by a part of a
-    sample; at a high rate this is seen, and is not worth a name. A backward difference is half a
-    sample late at any rate, and is no sensor's delay.
+    A rig that differentiates and filters its encoders reports velocities late by a fraction of a
+    sample. At a high rate this is visible, and too small to be a finding. A backward difference is
+    half a sample late at any rate, which is no delay of a sensor.
 
     :return: the data, and what was changed, in words
     """
@@ -97,23 +97,23 @@ def _replayed(twin: Twin, data: Trajectories) -> Trajectories:
     return Trajectories.from_arrays(list(simulated), list(actions), dt=data.dt)
 
 
-def in_step_with_the_log(
+def match_logged_integrator(
     twin: Twin, data: Trajectories
 ) -> tuple[Twin, Trajectories, tuple[str, ...]]:
     """
-    Where velocities are true half an interval before their positions: the twin with the rule of
-    integration that logs them so, or the data with velocities moved, whichever friction and an
-    offset at each joint explain better.
+    Where velocities are true half an interval before their positions, let the twin integrate by
+    semi-implicit Euler, which logs them so, or shift the velocities of the data: whichever has the
+    smaller residual beside friction and an offset at each joint.
 
-    Semi-implicit Euler's velocity is that of the middle of the interval before. A twin that
-    integrates accurately finds half an interval of delay and a few per cent of inertia there, which
-    are the simulator's.
+    The velocity of semi-implicit Euler is that of the middle of the previous interval. In such a
+    log, an accurate twin would find a delay of half an interval and a few per cent of inertia,
+    which are the simulator's.
 
     :param data: sampled at the twin's ``dt``
     :return: the twin, the data, and what was changed, in words
     """
-    plant = plant_of(twin)
-    if lag_of(twin) != 0.0 or not isinstance(plant, AnalyticTwin) or not _bare(twin):
+    bare = all(isinstance(layer, ExtendedTwin | AnalyticTwin) for layer in layers_of(twin))
+    if lag_of(twin) != 0.0 or not bare:
         return twin, data, ()
     channels = [e.velocity for e in encoders(twin).values() if e.velocity is not None]
     if not channels:
@@ -127,7 +127,7 @@ def in_step_with_the_log(
     half = f"{0.5e3 * data.dt:.2g} ms (half a sample) before the positions that they belong to"
     euler = stepping_by(twin, semi_implicit_euler).at_interval(twin.dt, 1)
     moved = _moved(data, channels)
-    if _left(euler, data) < _left(twin, moved):
+    if _log_residual(euler, data) < _log_residual(twin, moved):
         words = (
             f"Velocities come {half}, as a simulator logs them that steps by semi-implicit Euler: "
             "the twin steps in the same way here."
@@ -146,13 +146,8 @@ def stepping_by(twin: Twin, integrator: Integrator) -> Twin:
     return changed
 
 
-def _bare(twin: Twin) -> bool:
-    """Whether no wrapper is around the plant and its effects."""
-    return all(isinstance(layer, ExtendedTwin | AnalyticTwin) for layer in layers_of(twin))
-
-
-def _left(twin: Twin, data: Trajectories) -> float:
-    weight, left = what_friction_leaves(twin, motion(twin, data))
+def _log_residual(twin: Twin, data: Trajectories) -> float:
+    weight, left = residual_beside_friction(twin, motion(twin, data))
     return float(weight @ np.log(left))
 
 

@@ -13,7 +13,7 @@ from sb3_hds.core.twin import plant_of
 from sb3_hds.errors import EffectError
 from sb3_hds.sysid.estimation.evidence import Evidence
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
-from sb3_hds.sysid.estimation.shooting import motion_of
+from sb3_hds.sysid.motion.joints import motion_of
 
 # A typical size moves what is predicted by this share of what is measured.
 _SHARE = 0.05

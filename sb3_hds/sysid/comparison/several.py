@@ -11,9 +11,10 @@ from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.diagnosis.findings import Accepted
 from sb3_hds.sysid.equation.members import Member
 from sb3_hds.sysid.equation.screening import Screened
-from sb3_hds.sysid.estimation.candidates import Candidate, encoders
+from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point, in_threads
 from sb3_hds.sysid.estimation.shooting import Shots, evenly
+from sb3_hds.sysid.motion.joints import encoders
 
 # Level at which each member has to be missed by held-out recordings when it is left out.
 _LEVEL = 0.05
@@ -81,7 +82,7 @@ def confirmed_set(
         screened = screened.among(members)
         members = _members(search, screened)
     p, every = screened.problem, [m.item for m in screened.members]
-    carried = dict(zip(every, map(float, p.carried(every)), strict=True))
+    carried = dict(zip(every, map(float, p.force_shares(every)), strict=True))
     found = [
         _accepted(search, candidate, member, members, verdicts[key], base, lost.get(key))._replace(
             share=carried[member.item],

@@ -9,7 +9,8 @@ from jaxtyping import Float, Int
 from sb3_hds.core import Trajectories
 from sb3_hds.sysid.comparison.held_out import Split, split
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, Slopes
-from sb3_hds.sysid.estimation.shooting import Shots, evenly, motion_of, shots_of
+from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
+from sb3_hds.sysid.motion.joints import motion_of
 
 # Length of a window over which the missing force counts as constant, in periods of the motion, and
 # in steps.

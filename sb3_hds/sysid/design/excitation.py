@@ -1,17 +1,17 @@
 r"""
-How well commands would decide between answers, as a differentiable program.
+How well commands discriminate between answers, as a differentiable program.
 
-Let answer :math:`a` be true. Recorded in windows, each simulated from a start state of its own,
-answer :math:`b` leaves at least
+Let answer :math:`a` be true. In windows that are simulated from start states of their own, the
+residual of answer :math:`b` is at least
 
 .. math::
    \lambda_{ab} = \min_{z, x_0} \frac{1}{c} \sum_k
    \left\| \frac{y_a - y_b(\theta_b + L_b z, x_0)}{\sigma} \right\|^2 + \|z\|^2,
 
-linear in the start states :math:`x_0` and in :math:`z`: what the earlier data allow :math:`b` to
-change (:math:`L_b L_b^T` is the covariance of its parameters) counts as already changed in its
-favour. Half of it is the expected log-likelihood ratio, all data taken together; :math:`c` is the
-number of rows for each independent one.
+linearised in the start states :math:`x_0` and in :math:`z`: the parameters of :math:`b` are
+refitted within what the earlier data allow (:math:`L_b L_b^T` is their covariance). Half of it is
+the expected log-likelihood ratio of all data; :math:`c` is the number of rows for each independent
+one.
 
 Source: T-optimality, Atkinson and Fedorov, *The design of experiments for discriminating between
 two rival models*, Biometrika 62(1), 1975, with the prior of Ponce de Leon and Atkinson, Biometrika
@@ -20,12 +20,11 @@ two rival models*, Biometrika 62(1), 1975, with the prior of Ponce de Leon and A
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from sb3_hds.core import (
@@ -42,28 +41,28 @@ from sb3_hds.core import (
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.sysid.belief.answers import effect_key, effects_of
 from sb3_hds.sysid.design.limits import Bounds
-from sb3_hds.sysid.estimation.shooting import solve_normal, with_slopes
+from sb3_hds.sysid.estimation.shooting import eliminate_start, moved_by, with_slopes
 
-# Frequencies in the commands, at most, and the share of a recording in which they fade in, and
-# out.
+# Most frequencies in the commands, and the share of a recording in which they fade in and out.
 _MOST_SINES, _FADE = 24, 0.04
-# Added to the evidence whose logarithm is maximised: less than this decides nothing. And how much
-# information about parameters counts beside it: where nothing decides, the machine moves at least.
+# Added to the ratio whose logarithm is maximised: smaller ones are negligible. Weight of the
+# information about parameters beside it, so that commands move the machine even where nothing
+# discriminates.
 _LEAST, _BESIDE = 1.0, 0.1
-# Price of exceeding a limit, in units of the limit, and the share of it from which it counts.
+# Penalty of exceeding a limit, in units of the limit, and the share of it from which it counts.
 _PRICE, _NEAR = 200.0, 0.85
 
 
-class Question(NamedTuple):
+class DesignProblem(NamedTuple):
     """
-    The numbers of a design problem; those that no program depends on.
+    The numbers of a design problem: traced, so that one compiled program serves all of them.
 
     :param values: parameters of each answer, shape ``(m, p)``
     :param factor: of their covariances, shape ``(m, p, k)``
     :param corners: parameters for which limits hold, besides those of the answers, ``(c, p)``
     :param start: observation at the start, shape ``(n_obs,)``
     :param weight: reciprocal of the errors of each output, the channels first and then the forces
-        of the actuators at each joint; 0: it is not measured; shape ``(n_obs + dof,)``
+        of the actuators at each joint; 0 if it is not measured; shape ``(n_obs + dof,)``
     :param correlated: rows for each independent one
     """
 
@@ -75,9 +74,9 @@ class Question(NamedTuple):
     correlated: float
 
 
-class Told(NamedTuple):
+class Evaluation(NamedTuple):
     r"""
-    What commands for ``n`` recordings are worth, and what they ask of the machine.
+    Discrimination and usage of limits by commands for ``n`` recordings.
 
     :param ratios: :math:`\lambda_{ab}`, shape ``(m, m)``
     :param gains: information about the parameters of each answer [nats], shape ``(m,)``
@@ -98,9 +97,11 @@ class Told(NamedTuple):
 class Excitation:
     """
     :param twin: has the effects of all answers
-    :param bounds: that hold
+    Commands as sums of sines, and what they would decide.
+
+    :param bounds: limits of the machine
     :param n_steps: of a recording
-    :param window: steps of the windows in which it will be compared
+    :param window: steps of the windows in which answers will be compared
     """
 
     def __init__(self, twin: Twin, bounds: Bounds, n_steps: int, window: int) -> None:
@@ -117,65 +118,54 @@ class Excitation:
         self.cycles = np.concatenate([[0.0], cycles, cycles])
         self.sensors = {effect_key(e) for e in effects_of(twin) if isinstance(e, SensorEffect)}
         self._names = tuple(twin.parameters)
-        #: (commands, question) -> :class:`Told`
-        self.told = jax.jit(self._told)
-        #: (coefficients of each start, question) -> objective, largest usage of a limit, gradient
+        #: (commands, problem) -> :class:`Evaluation`
+        self.evaluate = jax.jit(self._evaluate)
+        #: (coefficients of each start, problem) -> objective, largest usage of a limit, gradient
         self.ascent = jax.jit(self._ascent)
 
     def commands(
         self, coefficients: Float[Array, "n waves act"] | np.ndarray
     ) -> Float[Array, "n steps act"]:
-        """:return: smooth, and within their limits whatever the coefficients are"""
+        """:return: smooth commands, within their limits for any coefficients"""
         low, high = self.bounds.command.T
         waves = jnp.einsum("tw,nwa->nta", self.basis, coefficients)
         return 0.5 * (low + high) + 0.5 * (high - low) * jnp.tanh(waves)
 
     def _ascent(
-        self, coefficients: Float[Array, "starts n waves act"], asked: Question
+        self, coefficients: Float[Array, "starts n waves act"], problem: DesignProblem
     ) -> tuple[Array, Array, Array]:
 
         def cost(one: Array) -> tuple[Array, tuple[Array, Array]]:
-            told = self._told(self.commands(one), asked)
-            m, usage = len(asked.values), told.usage
+            evaluation = self._evaluate(self.commands(one), problem)
+            m, usage = len(problem.values), evaluation.usage
             if m == 1:
-                worth = told.gains[0]
+                objective = evaluation.gains[0]
             else:
-                pairs = told.ratios[~np.eye(m, dtype=bool)]
-                worth = -jnp.log(jnp.mean(1.0 / (pairs + _LEAST)))
-                worth += _BESIDE * jnp.mean(told.gains)
+                pairs = evaluation.ratios[~np.eye(m, dtype=bool)]
+                objective = -jnp.log(jnp.mean(1.0 / (pairs + _LEAST)))
+                objective += _BESIDE * jnp.mean(evaluation.gains)
             finite = jnp.where(jnp.isfinite(usage), usage, 1e3)
             over = jnp.maximum(finite - _NEAR, 0.0)
-            return -worth + _PRICE * jnp.sum(over**2), (worth, jnp.max(finite))
+            return -objective + _PRICE * jnp.sum(over**2), (objective, jnp.max(finite))
 
         if self.twin.differentiability == "reverse":
-            (_, told), slopes = jax.vmap(jax.value_and_grad(cost, has_aux=True))(coefficients)
+            (_, found), slopes = jax.vmap(jax.value_and_grad(cost, has_aux=True))(coefficients)
         else:
-            slopes, told = jax.vmap(jax.jacfwd(cost, has_aux=True))(coefficients)
-        return told[0], told[1], slopes
+            slopes, found = jax.vmap(jax.jacfwd(cost, has_aux=True))(coefficients)
+        return found[0], found[1], slopes
 
-    def _between(
-        self, a: Any, b: Any, states: State, outputs: Array, actions: Array, asked: Question
-    ) -> tuple[Array, Array, Array]:
-        """What answer ``b`` leaves of what ``a`` predicts, scores and curvature by ``z``."""
-        mine, theirs = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in (a, b))
-        values, factor = jnp.asarray(asked.values[b]), jnp.asarray(asked.factor[b])
-        weight = jnp.asarray(asked.weight)
-
-        def one(mine: State, theirs: State, seen: Array, commands: Array) -> tuple[Array, ...]:
-            return self._normal(mine, theirs, seen, commands, values, factor, weight)
-
-        found = jax.vmap(one)(mine, theirs, outputs[a], actions)
-        rest, score, curvature = (jnp.sum(x, 0) / asked.correlated for x in found)
-        return rest, score, curvature
-
-    def _told(self, actions: Float[Array, "n steps act"], asked: Question) -> Told:
-        states, outputs, usage = self._rollouts(actions, asked)
-        m = len(asked.values)
+    def _evaluate(self, actions: Float[Array, "n steps act"], problem: DesignProblem) -> Evaluation:
+        states, outputs, usage = self._rollouts(actions, problem)
+        m = len(problem.values)
 
         def of(pair: Array) -> tuple[Array, Array, Array]:
-            rest, score, curvature = self._between(
-                pair[0], pair[1], states, outputs, actions, asked
-            )
+            """Residual of answer ``b`` if ``a`` is true, and information about ``b``."""
+            a, b = pair
+            mine, theirs = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in (a, b))
+            own = (jnp.asarray(problem.values[b]), jnp.asarray(problem.factor[b]))
+            normal = partial(self._normal, *own, jnp.asarray(problem.weight))
+            found = jax.vmap(normal)(mine, theirs, outputs[a], actions)
+            rest, score, curvature = (jnp.sum(x, 0) / problem.correlated for x in found)
             bread = curvature + jnp.eye(len(curvature), dtype=curvature.dtype)
             moved = jnp.linalg.solve(bread, score)
             return rest - score @ moved, 0.5 * jnp.linalg.slogdet(bread)[1], curvature
@@ -183,40 +173,40 @@ class Excitation:
         pairs = np.stack(np.meshgrid(range(m), range(m), indexing="ij"), -1).reshape(-1, 2)
         ratios, gains, curvature = jax.vmap(of)(jnp.asarray(pairs))
         own = jnp.diag(gains.reshape(m, m))
-        return Told(ratios.reshape(m, m), own, curvature[0], outputs[:m], usage)
+        return Evaluation(ratios.reshape(m, m), own, curvature[0], outputs[:m], usage)
 
-    def _rollouts(self, actions: Array, asked: Question) -> tuple[State, Array, Array]:
-        """Of the answers, then of the corners; only the answers' states are returned."""
-        vectors = jnp.concatenate([asked.values, asked.corners])
+    def _rollouts(self, actions: Array, problem: DesignProblem) -> tuple[State, Array, Array]:
+        """Simulate the answers, then the corners; only the answers' states are returned."""
+        vectors = jnp.concatenate([problem.values, problem.corners])
 
         def one(vector: Array, commands: Array) -> tuple[State, Array, Array]:
             params = self._params(vector)
-            begin = self.twin.infer(jnp.asarray(asked.start), params)
+            begin = self.twin.infer(jnp.asarray(problem.start), params)
             begin = jax.tree.map(lambda leaf: jnp.asarray(leaf, vector.dtype), begin)
             run = rollout(self.twin, params, begin, commands)
             force = self._forces(run.states, commands, params)
-            # What is on its way to the motor arrives, if only when the recording is over.
-            plain = self._forces(run.states, commands, params, on_its_way=False)
+            # Without the effects on commands too: a delayed command may act after the recording.
+            plain = self._forces(run.states, commands, params, with_effects=False)
             most = jnp.maximum(jnp.abs(force), jnp.abs(plain))
             outputs = jnp.concatenate([run.obs, force], 1)
             return run.states, outputs, self._usage(run.states, most)
 
         states, outputs, usage = jax.vmap(lambda v: jax.vmap(lambda a: one(v, a))(actions))(vectors)
-        states = jax.tree.map(lambda leaf: leaf[: len(asked.values)], states)
+        states = jax.tree.map(lambda leaf: leaf[: len(problem.values)], states)
         return states, outputs, jnp.max(usage, (0, 1))
 
     def _forces(
-        self, states: State, commands: Array, params: Params, on_its_way: bool = True
+        self, states: State, commands: Array, params: Params, with_effects: bool = True
     ) -> Array:
         """
-        Of the actuators at each joint, shape ``(steps + 1, dof)``; zeros where unknown.
+        Forces of the actuators at each joint, shape ``(steps + 1, dof)``; zeros where unknown.
 
-        :param on_its_way: whether what happens to a command on its way to the motor counts
+        :param with_effects: whether effects on the commands, such as a gain or a delay, count
         """
         if not isinstance(plant_of(self.twin), AnalyticTwin):
             return jnp.zeros((len(commands) + 1, len(self.twin.joints)), commands.dtype)
         before = jax.tree.map(lambda leaf: leaf[:-1], states)
-        force = jax.vmap(lambda s, u: actuator_force(self.twin, s, u, params, on_its_way))(
+        force = jax.vmap(lambda s, u: actuator_force(self.twin, s, u, params, with_effects))(
             before, commands
         )
         return jnp.concatenate([force, force[-1:]])
@@ -241,19 +231,19 @@ class Excitation:
 
     def _normal(
         self,
+        values: Array,
+        factor: Array,
+        weight: Array,
         mine: State,
         theirs: State,
         seen: Array,
         commands: Array,
-        values: Array,
-        factor: Array,
-        weight: Array,
     ) -> tuple[Array, Array, Array]:
         """
-        One recording under answer ``b``, in windows that begin where answer ``a`` is.
+        One recording under answer ``b``, in windows that begin in the states of answer ``a``.
 
         :param mine: states of ``a``
-        :param theirs: states of ``b``, for what its drives remember
+        :param theirs: states of ``b``, for the memory of its drives
         :param seen: outputs of ``a``
         :return: sum of squares, scores and curvature by ``z``, start states eliminated
         """
@@ -266,24 +256,17 @@ class Excitation:
         n_z, n_x = factor.shape[1], 2 * len(self.twin.joints)
 
         def window(begin: State, actions: Array, outputs: Array) -> tuple[Array, Array, Array]:
-            rest = ravel_pytree(begin.memory)[0]
-
             def error(both: Array) -> Array:
                 params = self._params(values + factor @ both[:n_z])
-                there = self.twin.retract(
-                    begin, jnp.concatenate([both[n_z:], jnp.zeros_like(rest)])
-                )
+                there = moved_by(self.twin, begin, both[n_z:])
                 there = jax.tree.map(lambda leaf, was: leaf.astype(was.dtype), there, begin)
                 run = rollout(self.twin, params, there, actions)
                 force = self._forces(run.states, actions, params)
-                told = jnp.concatenate([run.obs, force], 1)
-                return ((told - outputs)[:-1] * weight).ravel()
+                predicted = jnp.concatenate([run.obs, force], 1)
+                return ((predicted - outputs)[:-1] * weight).ravel()
 
-            now, slopes = with_slopes(error, jnp.zeros(n_z + n_x, begin.q.dtype))
-            by_z, by_x = slopes[:, :n_z], slopes[:, n_z:]
-            both = jnp.concatenate([now[:, None], by_z], 1)
-            free = both - by_x @ jax.vmap(partial(solve_normal, by_x), 1, 1)(both)
-            own, along = free[:, 0], free[:, 1:]
+            errors, slopes = with_slopes(error, jnp.zeros(n_z + n_x, begin.q.dtype))
+            own, along, _ = eliminate_start(errors, slopes, n_z)
             return own @ own, along.T @ own, along.T @ along
 
         found = jax.vmap(window)(begins, commands[rows], outputs)
@@ -295,12 +278,12 @@ class Excitation:
 
 
 def actuator_force(
-    twin: Twin, state: State, action: Array, params: Params, on_its_way: bool = True
+    twin: Twin, state: State, action: Array, params: Params, with_effects: bool = True
 ) -> Float[Array, " dof"]:
     """
     :param twin: of an ``AnalyticTwin``, with effects and wrappers or without
     :param action: as the outermost twin takes it, shape ``(n_act,)``
-    :param on_its_way: whether effects on the way of the command count, such as a gain or a delay
+    :param with_effects: whether effects on the command count, such as a gain or a delay
     :return: generalised force of the actuators at the beginning of a step [N m] or [N]
     """
     command = action
@@ -308,7 +291,7 @@ def actuator_force(
         if isinstance(layer, TransformedTwin):
             command = layer.command(state, command, params)
         elif isinstance(layer, ExtendedTwin):
-            if on_its_way:
+            if with_effects:
                 simulated = tuple(a for a in layer.attached if a.key in state.memory)
                 chain = EffectChain(simulated, params)
                 command, _ = chain.act(command, state.memory, twin.dt / twin.substeps)

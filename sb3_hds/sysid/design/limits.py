@@ -1,9 +1,10 @@
-"""What a machine may do while it is being identified."""
+"""Limits of a machine during identification."""
 
 import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,8 @@ from sb3_hds.core import AnalyticTwin, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.errors import ParameterError, did_you_mean
 
-#: quantities whose largest absolute value is limited at each joint, and their units where a joint
-#: turns and where it slides
-BY_JOINT = {
-    "velocity": ("rad/s", "m/s"),
-    "torque": ("N m", "N"),
-    "power": ("W", "W"),
-    "jerk": ("rad/s3", "m/s3"),
-}
-_PAIRS = ("position", "command")
+#: quantities whose largest absolute value is limited at each joint
+BY_JOINT = ("velocity", "torque", "power", "jerk")
 
 Given = float | Sequence[float] | Mapping[str, Any]
 
@@ -60,7 +54,14 @@ class Limits:
         if isinstance(given, Limits):
             return given
         if isinstance(given, str | os.PathLike):
-            given = _read(given)
+            import yaml
+
+            path, text = given, Path(given).read_text(encoding="utf-8")
+            try:
+                given = yaml.safe_load(text) or {}
+            except yaml.YAMLError as error:
+                words = " ".join(str(error).split())
+                raise ParameterError(f"{path} is no yml: {words}.") from None
         known = [field.name for field in dataclasses.fields(cls)]
         if not isinstance(given, Mapping):
             raise ParameterError(
@@ -93,10 +94,10 @@ class Limits:
                 f"{twin.name} does not compute the force of its actuators, so it cannot keep a "
                 f"limit of {' and '.join(needs_force)}. Limit the command instead."
             )
-        position = [(j.low, j.high) for j in twin.joints]
-        command = [(a.low, a.high) for a in twin.actuators]
-        position = _pairs("position", self.position, joints, position)
-        command = _pairs("command", self.command, actuators, command)
+        ranges = [(j.low, j.high) for j in twin.joints]
+        position = _pairs("position", self.position, joints, ranges)
+        ranges = [(a.low, a.high) for a in twin.actuators]
+        command = _pairs("command", self.command, actuators, ranges)
         for name, (low, high) in zip(actuators, command, strict=True):
             if not (math.isfinite(low) and math.isfinite(high)):
                 raise ParameterError(
@@ -132,22 +133,10 @@ class Bounds:
     bandwidth: float
 
 
-def _read(path: str | os.PathLike[str]) -> Any:
-    import yaml
-
-    with open(path, encoding="utf-8") as file:
-        try:
-            return yaml.safe_load(file) or {}
-        except yaml.YAMLError as error:
-            raise ParameterError(f"{path} is no yml: {' '.join(str(error).split())}.") from None
-
-
 def _pairs(
     limit: str, given: Given | None, names: list[str], default: list[tuple[float, float]]
 ) -> np.ndarray:
     found = np.array(default, float)
-    if given is None:
-        return found
     for i, own in _by_name(limit, given, names):
         own = (-own, own) if _is_number(own) else own
         pair = isinstance(own, Sequence) and len(own) == 2 and all(map(_is_number, own))
@@ -167,8 +156,6 @@ def _pairs(
 
 def _largest(limit: str, given: Given | None, names: list[str]) -> np.ndarray:
     found = np.full(len(names), np.inf)
-    if given is None:
-        return found
     for i, own in _by_name(limit, given, names):
         if not (_is_number(own) and own > 0.0):
             raise ParameterError(
@@ -178,7 +165,10 @@ def _largest(limit: str, given: Given | None, names: list[str]) -> np.ndarray:
     return found
 
 
-def _by_name(limit: str, given: Given, names: list[str]) -> list[tuple[int, Any]]:
+def _by_name(limit: str, given: Given | None, names: list[str]) -> list[tuple[int, Any]]:
+    """:return: index and value of each joint or actuator that has a limit"""
+    if given is None:
+        return []
     if not isinstance(given, Mapping):
         return [(i, given) for i in range(len(names))]
     unknown = [str(name) for name in given if name not in names]

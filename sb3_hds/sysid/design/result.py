@@ -1,4 +1,4 @@
-"""What a designed experiment says of itself, and how its commands are written."""
+"""The result of an experiment design, which prints itself and writes its commands."""
 
 import dataclasses
 import io
@@ -17,19 +17,19 @@ from sb3_hds.core.trajectories.storage import check_target, write_bytes
 from sb3_hds.errors import ParameterError
 
 _WIDTH = 80
-# Chance with which a question is decided.
+# Probability with which answers count as decided.
 SURE = 0.9
 
 
 class Pair(NamedTuple):
     """
-    Two answers, and what the recordings would say of them.
+    How well the recordings discriminate between two answers.
 
     :param true: the answer that is right
-    :param other: the answer that is to be ruled out
+    :param other: the answer to rule out
     :param ratio: expected logarithm of the likelihood ratio
-    :param chance: that the odds are beyond 19 to 1 for the right one
-    :param needed: as many recordings as these, over and over, for a chance of 90 %
+    :param chance: probability of odds beyond 19 to 1 for the right one
+    :param needed: number of such recordings for a probability of 90 %
     """
 
     true: str
@@ -50,12 +50,12 @@ class NextExperiment:
     :param predicted: channels as each answer predicts them, shape ``(m, n, steps + 1, n_obs)``
     :param channels: name and unit of each
     :param actuators: name and unit of each
-    :param pairs: of answers, those that are hardest to tell first; none where there is one answer
+    :param pairs: of answers, the hardest to discriminate first; none if there is one answer
     :param information: gained about the parameters of the likeliest answer [nats]
     :param narrower: by its parameters, their standard deviation now and after the recordings
-    :param usage: by limit and joint, the largest share that any answer takes
-    :param decides: whether a number of such recordings that one can make would tell
-    :param would_tell: what would, where they do not, in words
+    :param usage: by limit and joint, the largest share that any answer uses
+    :param decides: whether a feasible number of such recordings would decide
+    :param would_tell: what would decide if they do not, in words
     """
 
     commands: Trajectories
@@ -72,12 +72,12 @@ class NextExperiment:
 
     @property
     def chance(self) -> float:
-        """That the recordings decide between the two answers that are hardest to tell."""
+        """Probability that the recordings decide between the hardest pair of answers."""
         return self.pairs[0].chance if self.pairs else math.nan
 
     @property
     def needed(self) -> float:
-        """Recordings that would decide between these with a chance of 90 %."""
+        """Number of recordings that decide between this pair with a probability of 90 %."""
         return self.pairs[0].needed if self.pairs else math.nan
 
     @property
@@ -90,10 +90,12 @@ class NextExperiment:
             return f"Play {what}: it is worth {self.information:.1f} nats about the parameters."
         worst = self.pairs[0]
         if not self.decides:
+            every = {frozenset(p[:2]) for p in self.pairs}
+            sure = every - {frozenset(p[:2]) for p in self.pairs if p.chance < SURE}
+            some = f" Of {len(every)} pairs of answers, it tells {len(sure)} apart." if sure else ""
             return (
                 f"No recording within these limits tells {worst.true} from {worst.other}: the best "
-                f"that was found would have to be made {_number(worst.needed)} times."
-                f"{self._at_least()}"
+                f"that was found would have to be made {_number(worst.needed)} times.{some}"
             )
         if worst.chance >= SURE:
             return f"Play {what}: the answers are told apart with a chance of {worst.chance:.0%}."
@@ -101,14 +103,6 @@ class NextExperiment:
             f"Play {what}, {math.ceil(worst.needed)} times in all: one of them tells "
             f"{worst.true} from {worst.other} with a chance of {worst.chance:.0%}."
         )
-
-    def _at_least(self) -> str:
-        """What the recordings tell where they do not tell all."""
-        unsure = {frozenset(p[:2]) for p in self.pairs if p.chance < SURE}
-        every = {frozenset(p[:2]) for p in self.pairs}
-        if unsure == every:
-            return ""
-        return f" Of {len(every)} pairs of answers, it tells {len(every - unsure)} apart."
 
     def summary(self) -> str:
         """:return: all of it in 80 columns"""
@@ -118,8 +112,8 @@ class NextExperiment:
         if self.pairs:
             lines.append("   chance, and recordings for one of 90 %, to find")
             for name, chance, needed in self.told_apart():
-                told = f"  {chance:>7} {needed:>8}   {name}"
-                lines += textwrap.wrap(told, _WIDTH, subsequent_indent=" " * 21)
+                row = f"  {chance:>7} {needed:>8}   {name}"
+                lines += textwrap.wrap(row, _WIDTH, subsequent_indent=" " * 21)
         for name, (now, then) in self.narrower.items():
             lines.append(f"  {name}: standard deviation {now:.3g} -> {then:.3g}")
         lines.append("Most of each limit that any answer takes:")
@@ -131,7 +125,7 @@ class NextExperiment:
     __str__ = __repr__ = summary
 
     def told_apart(self) -> list[tuple[str, str, str]]:
-        """:return: of each pair its answers, the chance to decide, and recordings for 90 %"""
+        """:return: of each pair its answers, probability to decide, and recordings for 90 %"""
         return [
             (f"{p.true}, not {p.other}", f"{p.chance:.0%}", _number(p.needed)) for p in self.pairs
         ]
@@ -157,8 +151,8 @@ class NextExperiment:
         Write the commands.
 
         :param path: ``.csv``: time, recording, commands and predicted channels by name, a row for
-            each step; ``.npz``: ``commands``, for ``Trajectories.load``. A file of that name is
-            replaced as a whole.
+            each step; ``.npz``: ``commands``, for ``Trajectories.load``. An existing file is
+            replaced.
         :return: its path
         :raises ParameterError: for another ending
         :raises OSError: if there is no folder to write it in
@@ -187,9 +181,14 @@ class NextExperiment:
 
         :param path: of the picture, for example ``"next.png"``
         """
-        from sb3_hds.sysid.design.plots import plot_next
+        self.figure().savefig(path, dpi=150)
 
-        plot_next(self).savefig(path, dpi=150)
+    def figure(self, narrow: bool = False) -> Any:
+        """:return: the same as a figure of matplotlib, for a narrow page or a wide one"""
+        from sb3_hds.sysid.reporting.figures import plot_next
+
+        own = (self.predicted, self.answers, self.channels, self.actuators)
+        return plot_next(self.commands, *own, narrow=narrow)
 
 
 def check_file(path: str | os.PathLike[str]) -> None:

@@ -16,19 +16,19 @@ from sb3_hds.data.audit.jumps import Glitches, Outliers
 from sb3_hds.data.audit.velocity import BackwardDifference
 from sb3_hds.sysid.checks.adequacy import noise_of
 from sb3_hds.sysid.checks.conventions import Convention, other_convention
-from sb3_hds.sysid.checks.timing import in_step, in_step_with_the_log
+from sb3_hds.sysid.checks.timing import align_velocities, match_logged_integrator
 from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import Split, split
 from sb3_hds.sysid.comparison.scales import sized
 from sb3_hds.sysid.diagnosis.progress import Bar
-from sb3_hds.sysid.equation.motion import Motion, motion
 from sb3_hds.sysid.equation.screening import SMALL_MACHINE, Screened, screen
 from sb3_hds.sysid.equation.terms import terms
-from sb3_hds.sysid.estimation.calibrate import spread_of
+from sb3_hds.sysid.estimation.calibrate import channel_deviations
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.parameters import Belief
 from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
+from sb3_hds.sysid.motion.motion import Motion, motion
 
 # Length of a window in periods of the motion, within these numbers of steps; it is half as long
 # where there would be fewer windows than that.
@@ -199,9 +199,9 @@ def prepare(
     bar.stage("reading the log")
     data, audited, corrected = _without_glitches(twin, data)
     data, shortened = shortened_to(twin, data)
-    data, in_time = in_step(twin, data)
+    data, in_time = align_velocities(twin, data)
     sensor_noise = noise_of(data)
-    twin, data, as_logged = in_step_with_the_log(twin, data)
+    twin, data, as_logged = match_logged_integrator(twin, data)
     moved = motion(twin, data)
     period = moved.typical_period
     coarse, data, every = thinned(twin, data, moved.fastest)
@@ -235,7 +235,7 @@ def prepare(
         convention=convention,
         screened=screened,
         hypotheses=hypotheses,
-        spread=spread_of(data),
+        spread=channel_deviations(data),
         shots=shots,
         origin=origin,
         most_windows=most_windows,

@@ -1,7 +1,6 @@
-"""Which members of a set held-out data confirm, what stands for them, and what they leave."""
+"""Confirmation of the members of a set on held-out data, and their equivalents."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -9,21 +8,23 @@ from sb3_hds.sysid.equation.problem import SHARED, Problem
 from sb3_hds.sysid.equation.regression import TINY
 from sb3_hds.sysid.equation.weak_form import rich_columns
 
-# A member carries at least this share of a joint's force, and lowers held-out errors by a t of at
-# least this, and so much more for each unit of rarity.
+# Least share of a joint's force that a member carries, least t statistic of its held-out gain, and
+# its increase for each unit of rarity.
 _MATERIAL, _CONFIRMED, _RARE = 0.006, 1.5, 0.9
-# Below that share, one counts that takes this much off the logarithm of what the others leave.
+# Below that share, a member is kept if it lowers the logarithm of the others' residual by this
+# much.
 _TRACE, _MOST_OF_THE_REST = 1e-3, 0.7
-# A member whose force is below this multiple of what stays unexplained is a hint, no more; of what
-# is less rare than this, a smaller one.
+# A member whose force is below this multiple of the unexplained residual is only a hint; the
+# multiple is smaller for effects that are less rare than this.
 _OUTSTANDING, _RAREST = 1.5, 2.0
-# An alternative may score worse by this, and predicts held-out data as well to this t or share.
+# An alternative may score worse by this, and predicts held-out data as well to within this t or
+# share.
 _CLOSE, _WORSE, _SAME = 8.0, 2.0, 0.2
-# Whatever its t, a loss below this share of what the place gains may come from any misfit.
+# Region of practical equivalence: a loss below this share of the member's gain counts as none.
 _EQUIVALENT = 0.05
 _MOST_ALTERNATIVES = 12
-# Members of a family that are another one with more parameters, and the gain in the logarithm of
-# held-out errors that is not worth these.
+# Simpler members of a family, and the gain in the logarithm of held-out errors that does not
+# justify more parameters.
 _SIMPLER = {
     "stribeck_friction": "coulomb_friction",
     "load_dependent_friction": "coulomb_friction",
@@ -33,86 +34,72 @@ _SIMPLER = {
     "directional_gain": "torque_gain",
 }
 _NO_MATTER = 0.02
-# Share of a column that the other folds contain at least, or ridge regression takes it for more.
+# Least share of a column's power in the training folds: below it, ridge regression overestimates.
 _SOME = 0.02
 
 
-class Left(NamedTuple):
-    """
-    What a set leaves at a joint.
-
-    :param share: residual over force at the joint, root mean squares over rows
-    :param noise: residual in units of what velocity noise alone would leave
-    :param predictable: share of its variance that all columns together predict on held-out data
-    :param most: key of the candidate that would reduce it most
-    :param gain: relative decrease of the held-out error, compared with the nominal model
-    """
-
-    share: float
-    noise: float
-    predictable: float
-    most: str
-    gain: float
-
-
-def material(p: Problem, keys: list[int]) -> list[int]:
+def drop_negligible(p: Problem, keys: list[int]) -> list[int]:
     """Remove members with a negligible force, unless they explain most of what the others leave."""
     held = p.held_out(keys)
     kept: set[int] = set()
     while keys:
         own = [i in p.always or i in kept for i in keys]
-        share = np.where(own, 1.0, p.carried(keys))
+        share = np.where(own, 1.0, p.force_shares(keys))
         worst = int(np.argmin(share))
         if share[worst] > _MATERIAL:
             break
         rest = [i for i in keys if i != keys[worst]]
         without = p.held_out(rest)
-        if share[worst] > _TRACE and worth(p, without, held, keys[worst])[0] > _MOST_OF_THE_REST:
+        if (
+            share[worst] > _TRACE
+            and held_out_gain(p, without, held, keys[worst])[0] > _MOST_OF_THE_REST
+        ):
             kept.add(keys[worst])
         else:
             keys, held = rest, without
     return keys
 
 
-def confirmed(p: Problem, keys: list[int]) -> list[int]:
+def drop_unconfirmed(p: Problem, keys: list[int]) -> list[int]:
     """Remove members, the least significant first, until all lower held-out errors."""
     while keys:
         held = p.held_out(keys)
         t = [
             np.inf
             if i in p.always
-            else worth(p, p.held_out([m for m in keys if m != i]), held, i)[1]
+            else held_out_gain(p, p.held_out([m for m in keys if m != i]), held, i)[1]
             for i in keys
         ]
-        short = [x - _least_t(p, i) for i, x in zip(keys, t, strict=True)]
+        # The rarer a cause is, the surer it has to be.
+        short = [x - (_CONFIRMED + _RARE * p.rarity[i]) for i, x in zip(keys, t, strict=True)]
         if min(short) > 0.0:
             break
         rest = [i for i, x in zip(keys, short, strict=True) if x > min(short)]
-        keys = admitted(p, retuned(p, rest))
+        keys = enforce_bounds(p, retune(p, rest))
     return keys
 
 
-def retuned(p: Problem, keys: list[int]) -> list[int]:
-    """Choose the nonlinear parameters of each member anew, given the other members."""
+def retune(p: Problem, keys: list[int]) -> list[int]:
+    """Choose the nonlinear parameters of each member again, given the other members."""
     for place, i in enumerate(list(keys)):
         if p.items[i].settings and i not in p.always:
             same = [o for o, item in enumerate(p.items) if item.key == p.items[i].key]
             trials = [[*keys[:place], o, *keys[place + 1 :]] for o in same]
-            keys = min(trials, key=lambda t: (t[place] in p.beyond(t), p.solve(t).rss))
+            keys = min(trials, key=lambda t: (t[place] in p.out_of_bounds(t), p.solve(t).rss))
     return keys
 
 
-def admitted(p: Problem, keys: list[int]) -> list[int]:
-    """Replace members that left their bounds by simpler ones of their family, or remove them."""
-    while beyond := [i for i in p.beyond(keys) if i not in p.always]:
+def enforce_bounds(p: Problem, keys: list[int]) -> list[int]:
+    """Replace members out of their bounds by simpler ones of their family, or remove them."""
+    while beyond := [i for i in p.out_of_bounds(keys) if i not in p.always]:
         worst = max(beyond, key=lambda i: p.rarity[i])
         rest = [m for m in keys if m != worst]
-        trials = [rest, *([*rest, o] for o in simpler(p, worst))]
-        keys = min(trials, key=lambda t: (len(p.beyond(t)), p.score(t)))
+        trials = [rest, *([*rest, o] for o in simpler_items(p, worst))]
+        keys = min(trials, key=lambda t: (len(p.out_of_bounds(t)), p.score(t)))
     return keys
 
 
-def simpler(p: Problem, i: int) -> list[int]:
+def simpler_items(p: Problem, i: int) -> list[int]:
     """:return: items of the same family and place with fewer parameters"""
     name = _SIMPLER.get(p.items[i].candidate.name)
     return [
@@ -122,25 +109,25 @@ def simpler(p: Problem, i: int) -> list[int]:
     ]
 
 
-def simplified(p: Problem, keys: list[int]) -> list[int]:
+def simplify(p: Problem, keys: list[int]) -> list[int]:
     """Replace a member by a simpler one of its family that predicts held-out data as well."""
     for i in list(keys):
-        others = simpler(p, i)
+        others = simpler_items(p, i)
         if not others:
             continue
         rest = [m for m in keys if m != i]
         held = p.held_out(keys)
-        gained, _ = worth(p, p.held_out(rest), held, i)
+        gained, _ = held_out_gain(p, p.held_out(rest), held, i)
         for other in others:
             if not np.isfinite(p.score([*rest, other])):
                 continue
-            lost, t = worth(p, p.held_out([*rest, other]), held, i)
+            lost, t = held_out_gain(p, p.held_out([*rest, other]), held, i)
             if t < _WORSE or lost < max(_NO_MATTER, _EQUIVALENT * gained):
                 keys = [*rest, other]
     return keys
 
 
-def plausible_first(p: Problem, keys: list[int]) -> list[int]:
+def prefer_plausible(p: Problem, keys: list[int]) -> list[int]:
     """
     Among candidates that the data cannot distinguish, choose the one with the best prior odds.
     """
@@ -148,19 +135,20 @@ def plausible_first(p: Problem, keys: list[int]) -> list[int]:
         if i in p.always:
             continue
         rest, held = [m for m in keys if m != i], p.held_out(keys)
-        gained, _ = worth(p, p.held_out(rest), held, i)
-        others = [o for o in equals(p, keys, i, held, gained) if p.rarity[o] < p.rarity[i]]
+        gained, _ = held_out_gain(p, p.held_out(rest), held, i)
+        others = [o for o in equivalents(p, keys, i, held, gained) if p.rarity[o] < p.rarity[i]]
         if others:
             keys = [*rest, min(others, key=lambda o: (p.rarity[o], p.score([*rest, o])))]
     return keys
 
 
-def worth(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> tuple[float, float]:
+def held_out_gain(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> tuple[float, float]:
     """
     :param without: held-out squared errors without a member, shape ``(folds, dof)``
-    :param held: with it
-    :return: mean logarithm of their ratio, and its t over folds, at the member's own joint; where
-        it acts at several, at the one that gains most; of what all actuators share, over all
+    :param held: the same with it
+    :return: mean logarithm of their ratio, and its t statistic over folds, at the member's own
+        joint; at the one that gains most if it acts at several; over all joints if all actuators
+        share it
     """
     ratio = np.log((without + 1e-9) / (held + 1e-9))
     joints = p.joints(i)
@@ -169,12 +157,7 @@ def worth(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> tuple[fl
     return float(x.mean()), float(x.mean() / (x.std(ddof=1) / np.sqrt(len(x)) + 1e-9))
 
 
-def _least_t(p: Problem, i: int) -> float:
-    """The rarer a cause is, the surer it has to be."""
-    return _CONFIRMED + _RARE * p.rarity[i]
-
-
-def outstanding(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
+def split_hints(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
     """
     An effect that is no larger than the unexplained structure may be a part of that misfit.
 
@@ -182,56 +165,35 @@ def outstanding(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
     """
     keys, hints = list(keys), []
     while keys:
-        left = np.array(
-            [x.share * np.sqrt(np.clip(x.predictable, 0.0, 1.0)) for x in what_is_left(p, keys)]
-        )
-        found, ratio = p.solve(keys), []
+        found, grams = p.solve(keys), p.grams
+        rss = np.maximum([found.weights @ g @ found.weights for g in grams.by_joint], 1e-12)
+        share = np.sqrt(rss / grams.effective) * grams.scale / (p.force * grams.gain)
+        left = share * np.sqrt(np.clip(predictable(p, keys), 0.0, 1.0))
+        ratio = []
         for i in keys:
-            force = p.force_of(i, found) / p.force
-            own = force / np.maximum(left, 1e-6) / _least_ratio(p, i)
+            # Friction, which every joint has, may be smaller than rare effects.
+            least = _OUTSTANDING * (1.0 + min(p.rarity[i], _RAREST)) / (1.0 + _RAREST)
+            own = p.force_of(i, found) / p.force / np.maximum(left, 1e-6) / least
             ratio.append(np.inf if i in p.always else float(np.max(own)))
         if min(ratio) >= 1.0:
             break
-        worst = int(np.argmin(ratio))
-        hints.append(keys.pop(worst))
+        hints.append(keys.pop(int(np.argmin(ratio))))
     return keys, hints
 
 
-def _least_ratio(p: Problem, i: int) -> float:
-    """Friction that every joint has stands out sooner than what is rare."""
-    return _OUTSTANDING * (1.0 + min(p.rarity[i], _RAREST)) / (1.0 + _RAREST)
+def predictable(p: Problem, keys: Sequence[int]) -> np.ndarray:
+    """
+    Ridge regression of the residual of a set on all linear columns, fold by fold.
+
+    :return: share of each joint's residual variance that it predicts on held-out data
+    """
+    weights = p.solve(keys).weights
+    rich = rich_columns(list(p.items), np.arange(len(weights) - 1))
+    return np.array([_predictable(p, weights, rich, j) for j in range(p.dof)])
 
 
-def what_is_left(p: Problem, keys: Sequence[int]) -> list[Left]:
-    """:return: at each joint"""
-    weights, grams, out = p.solve(keys).weights, p.grams, []
-    nominal = p.held_out(list(p.always)).sum(0)
-    gain = 1.0 - np.sqrt(p.held_out(keys).sum(0) / np.maximum(nominal, 1e-300))
-    others = [i for i in range(len(p.items)) if i not in keys]
-    for j in range(p.dof):
-        gram = grams.by_joint[j]
-        rss = max(float(weights @ gram @ weights), 1e-12)
-        diagonal = np.diag(gram) + 1e-300
-        noise = np.sqrt(rss / grams.effective[j])
-        floor = grams.floor[j]
-        slope = (gram @ weights) ** 2 / diagonal / rss
-        most = max(others, key=lambda i: max(slope[list(p.items[i].free)], default=0.0), default=-1)
-        out.append(
-            Left(
-                share=float(noise * grams.scale[j] / (p.force[j] * grams.gain[j])),
-                noise=float(noise / floor) if floor > 0.0 else np.nan,
-                predictable=_predictable(p, weights, j, diagonal),
-                most=p.items[most].key if most >= 0 else "",
-                gain=float(gain[j]),
-            )
-        )
-    return out
-
-
-def _predictable(p: Problem, weights: np.ndarray, j: int, diagonal: np.ndarray) -> float:
-    """Ridge regression of what is left on all linear columns, fold by fold."""
-    columns = np.arange(len(weights) - 1)
-    rich = columns[rich_columns(list(p.items), columns)]
+def _predictable(p: Problem, weights: np.ndarray, rich: np.ndarray, j: int) -> float:
+    diagonal = np.diag(p.grams.by_joint[j]) + 1e-300
     rich = rich[diagonal[rich] > 1e-12]
     on = np.union1d(rich, np.flatnonzero(weights))
     rich, weights = np.searchsorted(on, rich), weights[on]
@@ -239,7 +201,7 @@ def _predictable(p: Problem, weights: np.ndarray, j: int, diagonal: np.ndarray) 
     base = predicted = 0.0
     for fold in (fold[np.ix_(on, on)] for fold in p.grams.folds[:, j]):
         train = every - fold
-        # Of what only this fold excites, the others say nothing.
+        # The training folds do not determine what only this fold excites.
         size = np.sqrt(np.maximum(np.diag(train)[rich], _SOME * diagonal[rich])) + TINY
         inner = train[np.ix_(rich, rich)] / np.outer(size, size)
         x = np.linalg.solve(inner + 0.02 * np.eye(len(rich)), (train[rich] @ weights) / size)
@@ -250,28 +212,28 @@ def _predictable(p: Problem, weights: np.ndarray, j: int, diagonal: np.ndarray) 
     return float(1.0 - predicted / base) if base > 0.0 else 0.0
 
 
-def equals(
+def equivalents(
     p: Problem, keys: Sequence[int], i: int, held: np.ndarray, gained: float
 ) -> Iterator[int]:
     """
     :param held: held-out errors of the set
     :param gained: mean logarithm of their ratio without the member
-    :return: items in whose place of the member the set is as good
+    :return: items with which, in place of the member, the set is as good
     """
     own, rest = p.score(keys), [m for m in keys if m != i]
-    for other in p.ranking(rest, swaps(p, keys, i))[:_MOST_ALTERNATIVES]:
+    for other in p.ranking(rest, substitutes(p, keys, i))[:_MOST_ALTERNATIVES]:
         if p.items[other].key == p.items[i].key:
             continue
         trial = [*rest, other]
         if p.score(trial) < own + _CLOSE:
-            lost, t = worth(p, p.held_out(trial), held, i)
+            lost, t = held_out_gain(p, p.held_out(trial), held, i)
             few, surely = lost < _EQUIVALENT * gained, t >= _WORSE
             if few or (not surely and lost < _SAME * max(gained, 1e-3)):
                 yield other
 
 
-def swaps(p: Problem, keys: Sequence[int], i: int) -> list[int]:
-    """:return: items that could be in the place of a member"""
+def substitutes(p: Problem, keys: Sequence[int], i: int) -> list[int]:
+    """:return: items that could take the place of a member"""
     taken = {p.family(m) for m in keys if m != i}
     own = set(p.joints(i))
     return [

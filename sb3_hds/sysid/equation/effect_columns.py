@@ -1,4 +1,4 @@
-"""Columns of effects: forces at joints, delayed or distorted commands, misread sensors."""
+"""Columns of effects: forces at joints, delayed or distorted commands, sensor errors."""
 
 import copy
 import dataclasses
@@ -16,16 +16,24 @@ from sb3_hds.core import ActionEffect, JointEffect, JointMoment, SensorEffect, S
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.effects import SensorDelay
 from sb3_hds.effects.joint import DryFriction
-from sb3_hds.sysid.equation.regression import STEP, Equation, Item, Rows, put, put_acting, ranges_of
-from sb3_hds.sysid.equation.terms import forces, portions, terms
-from sb3_hds.sysid.estimation.candidates import Candidate, encoders
-from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.equation.regression import (
+    STEP,
+    Equation,
+    Item,
+    put,
+    put_acting,
+    ranges_of,
+    residual_force,
+)
+from sb3_hds.sysid.equation.terms import forces, memory_of, portions, terms
+from sb3_hds.sysid.estimation.candidates import Candidate
+from sb3_hds.sysid.motion.joints import encoders
 
-# Places of a normal distribution, in standard deviations, and their weights (Gauss-Hermite).
+# Nodes for a normal distribution, in standard deviations, and their weights (Gauss-Hermite).
 _PLACES, _WEIGHTS = np.array([0.0, -np.sqrt(3.0), np.sqrt(3.0)]), np.array([4.0, 1.0, 1.0]) / 6.0
-# Places in an interval from 0 to 1, of equal weight (Gauss-Legendre).
+# Nodes in an interval from 0 to 1, of equal weight (Gauss-Legendre).
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
-# Braking below this in an interval is none: Lambert's W has a branch point there.
+# Least braking in an interval: Lambert's W has a branch point at zero.
 _NO_BRAKE = 1e-6
 
 #: by effect, its parameter and the force per unit of it at a velocity
@@ -42,12 +50,10 @@ def add_force(
     candidate: Candidate,
     effect: JointEffect,
     nodes: Mapping[str, np.ndarray],
-    rows: Rows,
 ) -> None:
     """Columns of a force at a joint: its derivatives by its parameters, at fixed settings."""
     j, motion = candidate.index, made.motion
-    ranges = ranges_of(made, rows, j, None)
-    settings = effect.grid(ranges)
+    settings = effect.grid(ranges_of(made, j, None))
     names = tuple(effect.parameters)
     nulls = {name: p.null for name, p in effect.parameters.items()}
     given = settings or ({},)
@@ -58,9 +64,7 @@ def add_force(
         for first in range(0, len(settings) - 1, 2):
             pair = [put(made, j, slopes[first + k, 0]) for k in (0, 1)]
             own = (settings[first], settings[first + 1])
-            made.items.append(
-                Item(candidate, tuple(pair), (None, None), "blend", own, (names[0], names[0]))
-            )
+            made.items.append(Item(candidate, tuple(pair), names[:1] * 2, "blend", own))
         return
     for at, by_name in zip(given, slopes, strict=True):
         useful = [
@@ -68,17 +72,8 @@ def add_force(
         ]
         if useful:
             columns = tuple(put(made, j, by_name[i]) for i in useful)
-            own = (at,) if at else ()
-            made.items.append(
-                Item(
-                    candidate,
-                    columns,
-                    (None,) * len(columns),
-                    "linear",
-                    own,
-                    tuple(names[i] for i in useful),
-                )
-            )
+            own = tuple(names[i] for i in useful)
+            made.items.append(Item(candidate, columns, own, settings=(at,) if at else ()))
 
 
 def add_closed_form(made: Equation, candidate: Candidate, nodes: Mapping[str, np.ndarray]) -> None:
@@ -86,22 +81,19 @@ def add_closed_form(made: Equation, candidate: Candidate, nodes: Mapping[str, np
     name, by_speed = CLOSED_FORMS[candidate.name]
     values = np.sum(nodes["weights"] * by_speed(nodes["v"]), axis=(1, 2))
     column = put(made, candidate.index, values)
-    made.items.append(Item(candidate, (column,), (None,), "linear", (), (name,)))
+    made.items.append(Item(candidate, (column,), (name,)))
 
 
-def nodes_of(
-    made: Equation, rows: Rows, bias: np.ndarray, inertia: np.ndarray, joint: int
-) -> dict[str, np.ndarray]:
+def nodes_of(made: Equation, inertia: np.ndarray, joint: int) -> dict[str, np.ndarray]:
     """
     Quadrature nodes of each interval, over the part that the twin's integrator evaluates: two
     points (Gauss-Legendre) before and after the velocity changes its sign, so that the mean of dry
-    friction is exact; each at three velocities (Gauss-Hermite, for the uncertainty of that moment).
-    Where the model brakes what a force sets in motion, a force counts the more, the later it acts.
+    friction is exact; each at three velocities (Gauss-Hermite), for the uncertainty of that
+    instant. Where the model brakes the motion, a force counts more the later it acts.
     """
-    motion, dt = made.motion, made.motion.dt
-    q, v, next_q, next_v = (
-        x[:, joint, None, None] for x in (rows.q, rows.v, rows.next_q, rows.next_v)
-    )
+    motion, rows, dt = made.motion, made.rows, made.motion.dt
+    ends = rows.q, rows.v, rows.next_q, rows.next_v
+    q, v, next_q, next_v = (x[:, joint, None, None] for x in ends)
     first = v + motion.error_v[joint] * _PLACES
     change = motion.seen * (next_v - v)
     turns = first * (first + change) < 0.0
@@ -109,7 +101,7 @@ def nodes_of(
     half = _GAUSS[:, None]
     inside = np.concatenate([before * half, before + (1.0 - before) * half], axis=1)
     shares = np.concatenate([before, before, 1.0 - before, 1.0 - before], axis=1)
-    shares = shares * lasting(made.mass, made.effective, joint, inside)
+    shares = shares * impulse_weights(made.terms.mass, made.effective, joint, inside)
     s = motion.seen * inside
     # A cubic through both ends, of velocities a line.
     position = (2 * s**3 - 3 * s**2 + 1) * q + dt * (s**3 - 2 * s**2 + s) * v
@@ -119,21 +111,23 @@ def nodes_of(
         "v": first + change * inside,
         "weights": 0.5 * shares * _WEIGHTS,
         "actuator": made.load[:, joint],
-        "load": bias[:, joint],
+        "load": made.terms.bias[:, joint],
         "inertia": inertia[:, joint],
     }
 
 
-def lasting(mass: np.ndarray, effective: np.ndarray, joint: int, places: np.ndarray) -> np.ndarray:
+def impulse_weights(
+    mass: np.ndarray, effective: np.ndarray, joint: int, places: np.ndarray
+) -> np.ndarray:
     r"""
-    With a braking rate :math:`r`, a force at the time :math:`s` of an interval :math:`h` leaves
-    :math:`e^{-r (h - s)}` of its impulse, and a constant one meets the mass times
+    With a braking rate :math:`r`, :math:`e^{-r (h - s)}` remains of the impulse of a force at the
+    time :math:`s` of an interval :math:`h`, and a constant force acts on the mass times
     :math:`x / (1 - e^{-x})`, :math:`x = r h`.
 
     :param mass: mass matrices, shape ``(n, dof, dof)``
-    :param effective: what a constant force meets over the interval, likewise
+    :param effective: effective inertias over the interval, shape ``(n, dof, dof)``
     :param places: in the interval, from 0 to 1, shape ``(n, ...)``
-    :return: by what a force there counts more than a constant one does on average
+    :return: weight of a force there, relative to a constant force
     """
     met = np.diagonal(np.linalg.inv(mass) @ effective, axis1=1, axis2=2)[:, joint]
     more = np.maximum(met, 1.0 + _NO_BRAKE)
@@ -147,20 +141,16 @@ def _force_slopes(
 ) -> np.ndarray:
     """:return: derivative of the mean force by each parameter, ``(settings, parameters, n)``"""
     found = []
-    effect, standstill = _for_any_joint(effect)
+    # One program serves all joints: the speed in which they differ is its argument.
+    standstill = 0.0
+    if isinstance(effect, DryFriction):
+        effect, standstill = _standing_still_at(effect, 1.0), effect.standstill
     with jax.enable_x64(True):
         for index, n in portions(len(nodes["load"])):
             given = {name: jnp.asarray(x[index], jnp.float64) for name, x in nodes.items()}
             slopes = [_slopes_of(effect, standstill, each, given, h) for each in settings]
             found.append(np.stack(slopes)[..., :n])
     return np.concatenate(found, -1)
-
-
-def _for_any_joint(effect: JointEffect) -> tuple[JointEffect, float]:
-    """One program serves all joints: what differs between them is told apart from the effect."""
-    if not isinstance(effect, DryFriction):
-        return effect, 0.0
-    return _standing_still_at(effect, 1.0), effect.standstill
 
 
 def _standing_still_at(effect: DryFriction, speed: Any) -> DryFriction:
@@ -195,60 +185,42 @@ def _slopes_of(
 
 
 # ------------------------------------------------------------------------------ commands
-def add_command(
-    made: Equation,
-    hypotheses: Hypotheses,
-    candidate: Candidate,
-    effect: ActionEffect,
-    rows: Rows,
-) -> None:
-    """Columns of what delays or distorts commands: changes of the actuators\' force."""
-    twin, i, dt = hypotheses.believed, candidate.index, made.motion.dt
+def add_command(made: Equation, candidate: Candidate, effect: ActionEffect) -> None:
+    """Columns of delayed or distorted commands: changes of the actuators' force."""
+    twin, rows, i = made.twin, made.rows, candidate.index
     if not rows.actions.size or not np.ptp(rows.actions[:, i]) > 0.0:
         return
-    ranges = ranges_of(made, rows, None, i)
-    settings, names = effect.grid(ranges), tuple(effect.parameters)
+    settings = effect.grid(ranges_of(made, None, i))
     nulls = {name: p.null for name, p in effect.parameters.items()}
     if effect.chained and len(settings) < 2:
         return
+    steps = {name: STEP * p.scale for name, p in effect.parameters.items()}
+    given = [{**nulls, **at} for at in settings]
     if not effect.chained:
-        steps = [STEP * effect.parameters[name].scale for name in names]
-        given = [{**nulls, name: nulls[name] + s} for name, s in zip(names, steps, strict=True)]
-    else:
-        given = [{**nulls, **at} for at in settings]
-    commands = _commanded(effect, given, rows, i, twin, dt)
+        given = [{**nulls, name: nulls[name] + step} for name, step in steps.items()]
+    commands = _commanded(made, effect, given, i)
     before = forces(twin, twin.params, rows.q, rows.v, rows.actions[None])[0]
     after = forces(twin, twin.params, rows.q, rows.v, commands)
     changes = after - before
     if not effect.chained:
-        columns, useful = [], []
-        for name, step, change in zip(names, steps, changes, strict=True):
-            if np.abs(change).max() > 0.0:
-                columns.append(put_acting(made, change / step))
-                useful.append(name)
+        columns = {
+            name: put_acting(made, change / step)
+            for (name, step), change in zip(steps.items(), changes, strict=True)
+            if np.abs(change).max() > 0.0
+        }
         if columns:
-            made.items.append(
-                Item(candidate, tuple(columns), (None,) * len(columns), "linear", (), tuple(useful))
-            )
+            made.items.append(Item(candidate, (*columns.values(),), (*columns,)))
         return
     for k in range(len(settings) - 1):
         whole = put_acting(made, changes[k])
         part = put_acting(made, changes[k + 1] - changes[k])
-        made.items.append(
-            Item(
-                candidate,
-                (whole, part),
-                (1.0, None),
-                "chain",
-                (settings[k], settings[k + 1]),
-                (effect.chained, effect.chained),
-            )
-        )
+        own = (effect.chained, effect.chained)
+        made.items.append(Item(candidate, (whole, part), own, "chain", settings[k : k + 2]))
 
 
-def add_common(made: Equation, hypotheses: Hypotheses) -> None:
-    """Causes that all actuators share, such as a late bus: sums of the columns of each actuator."""
-    for candidate in (c for c in hypotheses.candidates if c.slot == "actuator" and c.index < 0):
+def add_common(made: Equation, candidates: Sequence[Candidate]) -> None:
+    """Effects that all actuators share, such as a bus delay: sums of the columns of each one."""
+    for candidate in (c for c in candidates if c.slot == "actuator" and c.index < 0):
         own = [item for item in made.items if item.candidate.name == candidate.name]
         by_settings: dict[str, list[Item]] = {}
         for item in own:
@@ -257,29 +229,21 @@ def add_common(made: Equation, hypotheses: Hypotheses) -> None:
         for items in by_settings.values():
             if len(items) < places or places < 2:
                 continue
-            first = items[0]
             columns = []
-            for k in range(len(first.columns)):
+            for same in zip(*(item.columns for item in items), strict=True):
                 total = np.zeros_like(made.missing)
-                for item in items:
-                    column = made.columns[item.columns[k]]
-                    own_joint = slice(None) if column.joint is None else column.joint
-                    total[:, own_joint] += column.values
+                for column in (made.columns[c] for c in same):
+                    total[:, slice(None) if column.joint is None else column.joint] += column.values
                 columns.append(put(made, None, total))
-            made.items.append(
-                dataclasses.replace(first, candidate=candidate, columns=tuple(columns))
-            )
+            shared = dataclasses.replace(items[0], candidate=candidate, columns=tuple(columns))
+            made.items.append(shared)
 
 
 def _commanded(
-    effect: ActionEffect,
-    settings: Sequence[Mapping[str, float]],
-    rows: Rows,
-    index: int,
-    twin: Twin,
-    dt: float,
+    made: Equation, effect: ActionEffect, settings: Sequence[Mapping[str, float]], index: int
 ) -> np.ndarray:
     """:return: commands as they arrive under each setting, shape ``(settings, n, n_act)``"""
+    twin, rows, dt = made.twin, made.rows, made.motion.dt
     found = np.repeat(rows.actions[None], len(settings), 0).astype(float)
     names = tuple(effect.parameters)
     values = np.array([[at[name] for name in names] for at in settings])
@@ -314,24 +278,19 @@ def _arrived(effect: ActionEffect, values: Array, commands: Array, memory: Any, 
 
 
 # ------------------------------------------------------------------------------ sensors
-def add_sensor(
-    made: Equation,
-    hypotheses: Hypotheses,
-    candidate: Candidate,
-    effect: SensorEffect,
-    rows: Rows,
-    smooth: np.ndarray,
-) -> None:
-    """Minus the change of the residual force if the channel is read as the effect says."""
-    twin, channels = hypotheses.believed, (candidate.index,)
+def add_sensor(made: Equation, candidate: Candidate, effect: SensorEffect) -> None:
+    """Minus the change of the residual force if the channel is corrected for the effect."""
+    twin, rows, channels = made.twin, made.rows, (candidate.index,)
     if candidate.slot == "joint":
         channels = encoders(twin)[candidate.index].channels
     if isinstance(effect, SensorDelay):
         return
     (name, parameter), *others = effect.parameters.items()
     if others or parameter.upper - parameter.lower == 1.0:
-        return  # a switch is no matter of degree
-    spread = np.std(_observed(twin, rows.q, rows.v)[:, channels[0]])
+        return  # a switch has no size
+    with jax.enable_x64(True):
+        observed = np.asarray(_observations(twin, jnp.asarray(rows.q), jnp.asarray(rows.v)))
+    spread = np.std(observed[:, channels[0]])
     step = STEP * (spread if parameter.unit == "channel unit" else 1.0)
     if not step > 0.0:
         return
@@ -342,22 +301,17 @@ def add_sensor(
     q, v = read(rows.q, rows.v)
     _, next_v = read(rows.next_q, rows.next_v)
     there = terms(twin, twin.params, q, v, rows.actions)
-    effective = made.effective + there.mass - made.mass
-    moved = np.einsum("nij,nj->ni", effective, next_v - v - there.change) / made.motion.dt
-    column = -(moved - smooth) / step
+    effective = made.effective + there.mass - made.terms.mass
+    after = residual_force(effective, next_v - v - there.change, made.motion.dt)
+    column = -(after - made.smooth) / step
     if np.isfinite(column).all() and np.abs(column).max() > 0.0:
         index = put(made, None, column)
-        made.items.append(Item(candidate, (index,), (None,), "linear", (), (name,)))
-
-
-def _observed(twin: Twin, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    with jax.enable_x64(True):
-        return np.asarray(_observations(twin, jnp.asarray(q), jnp.asarray(v)))
+        made.items.append(Item(candidate, (index,), (name,)))
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
 def _observations(twin: Twin, q: Array, v: Array) -> Array:
-    memory = twin.infer(jnp.zeros(len(twin.channels), q.dtype), twin.params).memory
+    memory = memory_of(twin, twin.params, q.dtype)
     return jax.vmap(lambda q, v: twin.observe(State(q, v, memory), twin.params))(q, v)
 
 
@@ -369,15 +323,12 @@ def _reread(
     v: np.ndarray,
     value: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What joints did if a channel reports what the effect makes of it."""
+    """:return: motion of the joints if a channel is corrected for the effect"""
     with jax.enable_x64(True):
         found = _inverted(twin, effect, channels, jnp.asarray(q), jnp.asarray(v), value)
         new_q, new_v = map(np.asarray, found)
-    if not new_v.any():
-        new_v = v  # no velocity is observed: its scale is that of the position
-        (name,) = effect.parameters
-        if name == "scale":
-            new_v = v / value
+    if not new_v.any():  # no velocity is observed: its scale is that of the position
+        new_v = v / value if "scale" in effect.parameters else v
     turns = 2.0 * np.pi * np.round((q - new_q) / (2.0 * np.pi))
     rotary = np.array([joint.unit == "rad" for joint in twin.joints])
     return new_q + np.where(rotary, turns, 0.0), new_v
@@ -388,7 +339,7 @@ def _inverted(
     twin: Twin, effect: SensorEffect, channels: tuple[int, ...], q: Array, v: Array, value: float
 ) -> tuple[Array, Array]:
     (name,) = effect.parameters
-    memory = twin.infer(jnp.zeros(len(twin.channels), q.dtype), twin.params).memory
+    memory = memory_of(twin, twin.params, q.dtype)
 
     def one(q: Array, v: Array) -> tuple[Array, Array]:
         obs = twin.observe(State(q, v, memory), twin.params)

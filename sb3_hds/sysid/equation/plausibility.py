@@ -1,17 +1,18 @@
 """
-What an engineer would think of first: prior odds, physical limits, and which names exclude each
-other.
+Prior knowledge of an engineer: prior odds, physical limits, and which effects exclude each other.
 
-The odds say how much more often a machine has an effect that its model lacks than one that is given
-as a reference (viscous friction, which every joint has); they decide between explanations that data
-cannot tell apart, and a cause with poor odds has to explain more before it is named at all.
+Odds are relative to viscous friction, which every joint has and few models include. They decide
+between explanations that the data cannot distinguish, and a rarer cause has to explain more before
+it is named.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
 from sb3_hds.core import Twin
 from sb3_hds.sysid.estimation.candidates import Candidate
+from sb3_hds.sysid.motion.motion import SET_POINTS
 
 
 class Plausibility(NamedTuple):
@@ -67,32 +68,21 @@ TABLE: dict[str, Plausibility] = {
     "sign_flip": Plausibility("sign", 3.0, reason="wiring, and conventions of others"),
 }
 _UNKNOWN = Plausibility("", 3.0)
-# A set point is a number that arrives as it is, or late: no amplifier changes it.
+# Additional rarity of amplifier effects on set points, which arrive unchanged, if late.
 _SET_POINT = 3.0
 _OF_AMPLIFIERS = ("torque_gain", "directional_gain", "dead_zone", "saturation")
 
-#: units of commands that are targets of a servo
-SET_POINTS = ("rad", "rad/s", "m", "m/s", "deg", "deg/s")
 
-
+@functools.cache
 def plausibility(effect: str) -> Plausibility:
     """:param effect: name in the catalogue, or ``parameter.NAME``; others are taken to be rare"""
     name = effect.partition(".")[0]
     return TABLE.get(name, _UNKNOWN._replace(family=name))
 
 
-def rarity(effect: str, command: str = "") -> float:
-    """
-    :param effect: name in the catalogue
-    :param command: unit of the command of the actuator at which it is; empty elsewhere
-    :return: minus the logarithm of the prior odds
-    """
-    own = plausibility(effect).rarity
-    set_point = effect in _OF_AMPLIFIERS and command in SET_POINTS
-    return own + _SET_POINT if set_point else own
-
-
 def rarity_of(candidate: Candidate, twin: Twin) -> float:
-    """:return: :func:`rarity` of a candidate at its place in a twin"""
-    command = twin.actuators[candidate.index].unit if candidate.slot == "actuator" else ""
-    return rarity(candidate.name, command)
+    """:return: minus the logarithm of the prior odds of a candidate at its place in a twin"""
+    own = plausibility(candidate.name).rarity
+    if candidate.slot != "actuator" or candidate.name not in _OF_AMPLIFIERS:
+        return own
+    return own + _SET_POINT if twin.actuators[candidate.index].unit in SET_POINTS else own

@@ -15,17 +15,16 @@ from sb3_hds.sysid.equation.regression import TINY, Item
 from sb3_hds.sysid.equation.weak_form import Grams
 from sb3_hds.sysid.estimation.candidates import PARAMETER
 
-# Variance of a size in units of what it would be alone: beyond that, columns cannot be told apart.
+# Variance inflation of a coefficient beyond which columns count as collinear.
 _MOST_INFLATION = 200.0
-# Least share of changes of the logged command, or of the inertia, that a set may leave.
+# Least share of the logged command or the inertia that counts as left by a set.
 _LEAST_LEFT = 0.02
 _RIDGE = 1e-9
-# Of friction that falls as a joint begins to slide, the least share that stays: what falls further
-# stands for a curve of another form.
+# Least ratio of sliding to static friction: a steeper drop stands for a curve of another form.
 _LEAST_SLIDING = 0.3
-# Numbers that what is not linear costs beside its coefficients: a speed, a period.
+# Nonlinear parameters that cost as much as coefficients: a speed, a period.
 _HIDDEN = {"stribeck_friction": 1, "concave_friction": 1, "cogging": 1}
-# Place of what all actuators have in common.
+# Place of effects that all actuators share.
 SHARED = ("actuator", -1)
 
 
@@ -36,7 +35,7 @@ class Solution(NamedTuple):
     :param theta: coefficients
     :param inverse: of their normal matrix
     :param weights: of all columns in the residual; the last is that of the missing force
-    :param held: columns whose coefficients stand at a bound
+    :param held: columns whose coefficients are at a bound
     """
 
     rss: float
@@ -63,10 +62,10 @@ class Problem:
     :param prior: of each column, the inverse variance of the prior of its coefficient
     :param force: typical force of each joint [N m] or [N]
     :param shares: of each column, its root mean square at each joint, shape ``(dof, columns)``
-    :param passes: of saturations and dead zones, the share of commands that still pass
+    :param passes: of saturations and dead zones, the share of commands that they pass
     :param mass: some mass matrices, shape ``(n, dof, dof)``
     :param noisy: of columns that contain the smoothed acceleration, the one with the measured one
-    :param effective: likewise, effective inertia over an interval
+    :param effective: effective inertia over an interval, in the same rows
     :param noise: of each joint's acceleration, in any unit, shape ``(dof,)``
     :param slopes: of these by inertial parameters, by key
     :param drives: share of each joint's actuator force by parameters, by key
@@ -74,8 +73,6 @@ class Problem:
     :param least: of what makes commands late, the smallest admissible coefficient
     :param always: items of every set: the nuisance parameters
     :param rarity: of each item, minus the logarithm of its prior odds
-    :param total: normal matrix over all joints, shape ``(columns + 1, columns + 1)``
-    :param cost: penalty of one parameter: the logarithm of the effective number of rows
     """
 
     items: tuple[Item, ...]
@@ -96,12 +93,20 @@ class Problem:
     least: dict[int, float]
     always: tuple[int, ...]
     rarity: tuple[float, ...]
-    total: np.ndarray
-    cost: float
 
     @property
     def dof(self) -> int:
         return len(self.grams.effective)
+
+    @cached_property
+    def total(self) -> np.ndarray:
+        """Normal matrix over all joints, shape ``(columns + 1, columns + 1)``."""
+        return self.grams.by_joint.sum(0)
+
+    @cached_property
+    def cost(self) -> float:
+        """Penalty of one parameter: the logarithm of the effective number of rows."""
+        return float(np.log(self.grams.effective.mean()))
 
     def place(self, i: int) -> tuple[str, int]:
         """:return: slot and index"""
@@ -110,23 +115,17 @@ class Problem:
 
     def family(self, i: int) -> tuple:
         """A set contains at most one item of each family."""
-        return self._families[i]
-
-    @cached_property
-    def _families(self) -> tuple[tuple, ...]:
-        return tuple(
-            (item.key,)
-            if item.candidate.slot == PARAMETER
-            else (plausibility(item.candidate.name).family, *self.place(i))
-            for i, item in enumerate(self.items)
-        )
+        candidate = self.items[i].candidate
+        if candidate.slot == PARAMETER:
+            return (candidate.key,)
+        return plausibility(candidate.name).family, *self.place(i)
 
     def clashes(self, keys: Sequence[int]) -> bool:
         """Whether two items exclude each other."""
         families = [self.family(i) for i in keys]
         if len(set(families)) < len(families):
             return True
-        common = {f[0] for f in families if f[1:] == ("actuator", -1)}
+        common = {f[0] for f in families if f[1:] == SHARED}
         return any(f[0] in common and f[1:2] == ("actuator",) and f[2] >= 0 for f in families)
 
     def joints(self, i: int) -> np.ndarray:
@@ -159,7 +158,7 @@ class Problem:
 
     def solve(self, keys: Sequence[int], total: np.ndarray | None = None) -> Solution:
         """
-        Least squares within bounds: what would leave its bounds, the farthest first, stays there.
+        Least squares within bounds: coefficients out of bounds are fixed there, the farthest first.
 
         :param total: normal equations; default: those of all data
         """
@@ -168,10 +167,7 @@ class Problem:
         free = [c for item in items for c in item.free]
         weights = np.zeros(len(gram))
         weights[-1] = 1.0
-        for item in items:
-            for c, value in zip(item.columns, item.fixed, strict=True):
-                if value is not None:
-                    weights[c] = -value
+        weights[[item.columns[0] for item in items if item.rule == "chain"]] = -1.0
         own = np.array([*dict.fromkeys(c for item in items for c in item.columns), len(gram) - 1])
         local = gram[own[:, None], own]
         at = {int(c): k for k, c in enumerate(own)}
@@ -182,7 +178,7 @@ class Problem:
             theta, inverse = self._least_squares(local, weights[own], inside, self.prior[free])
             if inverse is None:
                 return Solution(np.inf, free, theta, np.zeros((len(free),) * 2), weights, ())
-            if not held and (common := self._stood_in_for(keys, free, inverse)):
+            if not held and (common := self._aliased_nuisance(keys, free, inverse)):
                 return self.solve([i for i in keys if i not in common], total)
             beyond = np.maximum(self.lower[free] - theta, theta - self.upper[free])
             beyond = np.where([c in bounded for c in free], beyond, -np.inf)
@@ -218,10 +214,10 @@ class Problem:
             return np.zeros(len(free)), None
         return theta, inverse / np.outer(size, size)
 
-    def _stood_in_for(
+    def _aliased_nuisance(
         self, keys: Sequence[int], free: Sequence[int], inverse: np.ndarray
     ) -> set[int]:
-        """What is refitted anyway, and cannot be told from members: these stand in for it."""
+        """:return: the nuisance item that is most collinear with members, which replace it"""
         if not len(free):
             return set()
         inflation = dict(zip(free, self._inflation(free, inverse), strict=True))
@@ -233,8 +229,8 @@ class Problem:
             for i in keys
             if i in self.always and any(set(self.joints(i)) & set(self.joints(m)) for m in members)
         }
-        worst = max(beyond, key=lambda i: beyond[i], default=-1)
-        return {worst} if worst >= 0 and beyond[worst] > _MOST_INFLATION else set()
+        worst = max(beyond, key=lambda i: beyond[i], default=None)
+        return set() if worst is None or beyond[worst] <= _MOST_INFLATION else {worst}
 
     def _inflation(self, free: Sequence[int], inverse: np.ndarray) -> np.ndarray:
         """:return: variance of each coefficient, in units of what it would be alone"""
@@ -249,7 +245,7 @@ class Problem:
             return False
         return all(self._inside(i, found) for i in keys)
 
-    def beyond(self, keys: Sequence[int]) -> list[int]:
+    def out_of_bounds(self, keys: Sequence[int]) -> list[int]:
         """:return: members at their bounds, or with sizes that are physically impossible"""
         found = self.solve(keys)
         return [i for i in keys if not self._inside(i, found)]
@@ -280,17 +276,17 @@ class Problem:
         found = self.solve(keys)
         if not self.admissible(keys, found):
             return np.inf
-        rss = self.by_joint(self._judged(found.weights), self.grams.by_joint)
+        rss = self.by_joint(self._with_measured_accelerations(found.weights), self.grams.by_joint)
         n = self.grams.effective
-        left = np.log(np.maximum(rss, 1e-9) / n) - self.taken_away(keys, found)
+        left = np.log(np.maximum(rss, 1e-9) / n) - self.lost_excitation(keys, found)
         prior = float(np.sum(self.prior[found.free] * found.theta**2))
         prices = sum(map(self.price, keys)) if priced else 0.0
         return float(np.sum(n * left)) + prior + prices
 
-    def _judged(self, weights: np.ndarray) -> np.ndarray:
+    def _with_measured_accelerations(self, weights: np.ndarray) -> np.ndarray:
         """
-        Coefficients come from smoothed accelerations, or noise would make inertias smaller;
-        residuals from measured ones: twice the inertia is twice the noise.
+        Coefficients are estimated with smoothed accelerations, since noise would bias inertias
+        towards zero; residuals use the measured ones: twice the inertia has twice the noise.
         """
         smooth, noisy, judged = list(self.noisy), list(self.noisy.values()), weights.copy()
         judged[noisy], judged[smooth] = weights[smooth], 0.0
@@ -301,14 +297,13 @@ class Problem:
         on = np.flatnonzero(weights)
         return np.einsum("i,...ik,k->...", weights[on], gram[..., on[:, None], on], weights[on])
 
-    def taken_away(self, keys: Sequence[int], found: Solution) -> np.ndarray:
+    def lost_excitation(self, keys: Sequence[int], found: Solution) -> np.ndarray:
         """
-        Twice the logarithm of how much of the equation a set takes away, by joint, at most zero.
+        Twice the logarithm of the share of the equation that a set leaves, by joint, at most zero.
 
         The equation is homogeneous: without torque (a gain of zero, a dead zone as wide as the
-        commands, saturation at the level of dry friction) and without inertia it says that nothing
-        equals nothing, and fits. So residuals count relative to what is left of the logged command
-        and of the inertia.
+        commands, saturation at the level of dry friction) and without inertia it fits trivially,
+        0 = 0. So residuals count relative to the remaining command and inertia.
         """
         out, value = np.zeros(self.dof), found.value
         for i in keys:
@@ -322,12 +317,12 @@ class Problem:
             elif item.key in self.drives:
                 change = value.get(item.columns[0], 0.0) * self.drives[item.key]
                 out += 2.0 * np.minimum(0.0, np.log(np.maximum(1.0 + change, _LEAST_LEFT)))
-        return out + np.minimum(0.0, self._quieter(keys, value))
+        return out + np.minimum(0.0, self._change_of_noise(keys, value))
 
-    def _quieter(self, keys: Sequence[int], value: dict[int, float]) -> np.ndarray:
+    def _change_of_noise(self, keys: Sequence[int], value: dict[int, float]) -> np.ndarray:
         """
-        :return: twice the logarithm of how large the force of the accelerations' noise is at each
-            joint with another inertia, compared with the nominal one
+        :return: twice the logarithm of the force of the accelerations' noise at each joint,
+            relative to that with the nominal inertia
         """
         changes = [
             value.get(self.items[i].columns[0], 0.0) * self.slopes[self.items[i].key]
@@ -350,13 +345,13 @@ class Problem:
         out = []
         for fold, beside in zip(self.grams.folds, self._beside, strict=True):
             found = self.solve(keys, beside)
-            rss = self.by_joint(self._judged(found.weights), fold)
-            taken = np.maximum(self.taken_away(keys, found), -6.0)
+            rss = self.by_joint(self._with_measured_accelerations(found.weights), fold)
+            taken = np.maximum(self.lost_excitation(keys, found), -6.0)
             out.append(rss * np.exp(-taken))
         return np.array(out)
 
     def ranking(self, keys: Sequence[int], among: Sequence[int] | None = None) -> list[int]:
-        """:return: items by what they would take off the residual, best first"""
+        """:return: items by how much they would lower the residual, best first"""
         found = self.solve(keys)
         if not np.isfinite(found.rss):
             return []
@@ -386,15 +381,14 @@ class Problem:
         order = np.argsort(gains)[::-1]
         return [pool[k] for k in order if gains[k] > 0.5 * self.cost]
 
-    def carried(self, keys: Sequence[int]) -> np.ndarray:
+    def force_shares(self, keys: Sequence[int]) -> np.ndarray:
         """:return: of each member, the largest share of a joint's force that it carries"""
         found = self.solve(keys)
         return np.array([float(np.max(self.force_of(i, found) / self.force)) for i in keys])
 
     def force_of(self, i: int, found: Solution) -> np.ndarray:
         """:return: root mean square force of a member at each joint"""
-        value, item = found.value, self.items[i]
-        total = np.zeros(self.dof)
-        for c, fixed in zip(item.columns, item.fixed, strict=True):
-            total += (value.get(c, fixed or 0.0) * self.shares[:, c]) ** 2
-        return np.sqrt(total)
+        item, value = self.items[i], found.value
+        if item.rule == "chain":
+            value = {item.columns[0]: 1.0} | value
+        return np.sqrt(sum((value.get(c, 0.0) * self.shares[:, c]) ** 2 for c in item.columns))

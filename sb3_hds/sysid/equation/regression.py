@@ -2,21 +2,21 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sb3_hds.core import Effect, Ranges
-from sb3_hds.sysid.equation.motion import Motion
+from sb3_hds.core import Effect, Ranges, Twin
+from sb3_hds.sysid.equation.terms import Terms
 from sb3_hds.sysid.estimation.candidates import Candidate
+from sb3_hds.sysid.motion.motion import Motion
 
-#: Added to sizes that columns are divided by; its square is not zero.
+#: added to the norms by which columns are divided; its square is not zero
 TINY = 1e-100
 # Finite differences by a parameter or a sensor, in shares of its scale.
 STEP = 1e-3
 
-Rule = Literal["linear", "chain", "blend", "switch"]
+Rule = Literal["linear", "chain", "blend"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,28 +25,26 @@ class Item:
     A candidate with its nonlinear parameters at fixed values, or between two.
 
     :param candidate: which
-    :param columns: indices
-    :param fixed: of each column, a fixed coefficient; None: it is estimated
+    :param columns: indices; of a ``"chain"``, the first has the coefficient one
+    :param names: short name of the parameter of each column
     :param rule: how coefficients become sizes
     :param settings: values of its parameters, by short name, at which the columns were taken
-    :param names: short name of the parameter of each column
     """
 
     candidate: Candidate
     columns: tuple[int, ...]
-    fixed: tuple[float | None, ...]
-    rule: Rule
-    settings: tuple[Mapping[str, float], ...]
     names: tuple[str, ...]
+    rule: Rule = "linear"
+    settings: tuple[Mapping[str, float], ...] = ()
 
     @property
     def key(self) -> str:
         return self.candidate.key
 
-    @cached_property
+    @property
     def free(self) -> tuple[int, ...]:
         """Columns whose coefficients are estimated."""
-        return tuple(c for c, f in zip(self.columns, self.fixed, strict=True) if f is None)
+        return self.columns[1:] if self.rule == "chain" else self.columns
 
     def sizes(
         self, effect: Effect | None, coefficients: Sequence[float] | np.ndarray
@@ -63,8 +61,6 @@ class Item:
         if self.rule == "blend":
             assert effect is not None
             return effect.blend((coefficients[0], coefficients[1]), self.settings)  # type: ignore[arg-type]
-        if self.rule == "switch":
-            return dict(self.settings[0])
         found = dict(self.settings[0]) if self.settings else {}
         for name, value in zip(self.names, coefficients, strict=True):
             null = effect.parameters[name].null if effect is not None else 0.0
@@ -88,46 +84,6 @@ class Column(NamedTuple):
         return self.values if self.joint == joint else None
 
 
-@dataclasses.dataclass
-class Equation:
-    """
-    The equation of motion along all recordings, one row for each interval.
-
-    :param missing: residual force of the nominal model, shape ``(n, dof)`` [N m] or [N]
-    :param columns: what candidates would add
-    :param items: candidates, several with different settings
-    :param recording: that each row is from, shape ``(n,)``
-    :param q: smoothed positions where an interval begins, shape ``(n, dof)``
-    :param v: smoothed velocities there
-    :param load: force that the nominal model transmits: inertia, gravity, shape ``(n, dof)``
-    :param actuator: force of the actuators, shape ``(n, dof)``
-    :param mass: mass matrix, shape ``(n, dof, dof)``
-    :param effective: effective inertia over an interval, likewise: force over change of velocity,
-        with damping
-    :param noisy: of columns that contain the acceleration, smoothed, the index of the same column
-        with the measured one
-    :param slopes: of the mass matrix by inertial parameters, by key of the candidate
-    :param drives: by which share of the actuators' force that changes with a unit of a parameter,
-        at each joint, likewise
-    :param motion: what they come from
-    """
-
-    missing: np.ndarray
-    columns: list[Column]
-    items: list[Item]
-    recording: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    load: np.ndarray
-    actuator: np.ndarray
-    mass: np.ndarray
-    effective: np.ndarray
-    noisy: dict[int, int]
-    slopes: dict[str, np.ndarray]
-    drives: dict[str, np.ndarray]
-    motion: Motion
-
-
 class Rows(NamedTuple):
     """All recordings, one after the other: where intervals begin and end."""
 
@@ -142,6 +98,49 @@ class Rows(NamedTuple):
     next_v: np.ndarray
 
 
+@dataclasses.dataclass
+class Equation:
+    """
+    The equation of motion along all recordings, one row for each interval.
+
+    :param twin: nominal model, at the interval of the motion
+    :param motion: from which it was made
+    :param rows: of the motion
+    :param terms: of the nominal model in these rows
+    :param effective: effective inertia over an interval, force over change of velocity with
+        damping, shape ``(n, dof, dof)``
+    :param load: force that the nominal model transmits: inertia, gravity, shape ``(n, dof)``
+    :param missing: residual force of the nominal model, shape ``(n, dof)`` [N m] or [N]
+    :param smooth: the same with smoothed velocities
+    :param columns: what candidates would add
+    :param items: candidates, several with different settings
+    :param noisy: of columns that contain the acceleration, smoothed, the index of the same column
+        with the measured one
+    :param slopes: of the mass matrix by inertial parameters, by key of the candidate
+    :param drives: relative change of the actuators' force with a unit of a parameter at each joint,
+        by key of the candidate
+    """
+
+    twin: Twin
+    motion: Motion
+    rows: Rows
+    terms: Terms
+    effective: np.ndarray
+    load: np.ndarray
+    missing: np.ndarray
+    smooth: np.ndarray
+    columns: list[Column] = dataclasses.field(default_factory=list)
+    items: list[Item] = dataclasses.field(default_factory=list)
+    noisy: dict[int, int] = dataclasses.field(default_factory=dict)
+    slopes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    drives: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+
+def residual_force(inertia: np.ndarray, change: np.ndarray, dt: float) -> np.ndarray:
+    """:return: force that changes velocities by this much in an interval, shape ``(n, dof)``"""
+    return np.einsum("nij,nj->ni", inertia, change) / dt
+
+
 def put(made: Equation, joint: int | None, values: np.ndarray) -> int:
     """:return: index of a new column"""
     made.columns.append(Column(joint, values))
@@ -149,20 +148,18 @@ def put(made: Equation, joint: int | None, values: np.ndarray) -> int:
 
 
 def put_acting(made: Equation, values: np.ndarray) -> int:
-    """:return: index of a new column, at a single joint if it acts at one only"""
+    """:return: index of a new column, at a single joint if it acts at only one"""
     acting = np.flatnonzero(np.abs(values).max(0) > 0.0)
-    return (
-        put(made, int(acting[0]), values[:, acting[0]])
-        if len(acting) == 1
-        else put(made, None, values)
-    )
+    if len(acting) == 1:
+        return put(made, int(acting[0]), values[:, acting[0]])
+    return put(made, None, values)
 
 
-def ranges_of(made: Equation, rows: Rows, joint: int | None, actuator: int | None) -> Ranges:
+def ranges_of(made: Equation, joint: int | None, actuator: int | None) -> Ranges:
     """:return: ranges of the motion and the commands, from which effects choose their settings"""
     motion, command = made.motion, np.zeros(1)
     if actuator is not None:
-        command = rows.actions[:, actuator]
+        command = made.rows.actions[:, actuator]
     own = slice(None) if joint is None else slice(joint, joint + 1)
     return Ranges(
         excursion=float(np.max(motion.excursion[own])),

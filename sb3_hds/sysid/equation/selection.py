@@ -1,68 +1,61 @@
-"""Which causes, all at once: a search over families, judged on data that were held out."""
+"""Subset selection: a local search over sets of causes, confirmed on held-out data."""
 
-from collections.abc import Callable, Collection
-from typing import NamedTuple
+from collections.abc import Collection
 
 import numpy as np
 
 from sb3_hds.sysid.equation.confirmation import (
-    confirmed,
-    material,
-    outstanding,
-    plausible_first,
-    simplified,
-    swaps,
+    drop_negligible,
+    drop_unconfirmed,
+    prefer_plausible,
+    simplify,
+    split_hints,
+    substitutes,
 )
 from sb3_hds.sysid.equation.problem import SHARED, Problem
+from sb3_hds.sysid.estimation.candidates import PARAMETER
 
-# Moves that are tried from each set: of what promises most when added, and in the place of another.
+# Moves that are tried from each set: best additions, best substitutes of a member, and rounds.
 _ADDED, _SWAPPED, _MOST_MOVES = 12, 5, 80
-# Members of which so rare ones are doubted, and how many.
+# Rarity from which members are retried without, and how many.
 _DOUBTFUL, _MOST_SHAKEN = 1.5, 4
 _VISCOUS, _DRY = "viscous_friction", "coulomb_friction"
 #: effects that make commands late
 LATE = ("action_delay", "motor_lag")
-# Joints at which the same effect may stand for something that all share.
+# Number of joints from which the same effect may stand for one that all actuators share.
 _MANY_JOINTS = 3
 
 
-class Proposal(NamedTuple):
+def propose(problem: Problem) -> tuple[list[int], list[int]]:
     """
-    :param keys: items of the set
-    :param hints: items that are small beside what stays unexplained
+    :return: items of the set of causes that explains most for its price, each of which held-out
+        data confirm; and hints: items that are small beside the unexplained residual
     """
-
-    keys: tuple[int, ...]
-    hints: tuple[int, ...]
-
-
-def propose(problem: Problem) -> Proposal:
-    """:return: the set of causes that explains most for its price, each of which data confirm"""
-    starts = _starts(problem)
-    results = [_climb(problem, keys) for keys in starts]
-    _, keys = min(results, key=lambda r: r[0])
-    keys = _shared_instead(problem, keys)
-    keys = _shaken(problem, keys)
-    keys = material(problem, keys)
-    keys = simplified(problem, keys)
-    keys = plausible_first(problem, keys)
-    keys = simplified(problem, confirmed(problem, keys))
-    kept, hints = outstanding(problem, keys)
-    return Proposal(tuple(kept), tuple(hints))
+    _, keys = min((_climb(problem, start) for start in _starts(problem)), key=lambda r: r[0])
+    keys = _try_shared(problem, keys)
+    keys = _retry_without_doubtful(problem, keys)
+    keys = drop_negligible(problem, keys)
+    keys = simplify(problem, keys)
+    keys = prefer_plausible(problem, keys)
+    keys = simplify(problem, drop_unconfirmed(problem, keys))
+    return split_hints(problem, keys)
 
 
 # ------------------------------------------------------------------------------ starts
 def _starts(p: Problem) -> list[list[int]]:
-    """Whole machines: friction at every joint, the same with everything late, and nothing."""
+    """Friction at every joint, the same with delayed commands, and the nuisances alone."""
     friction = _friction_beside(p, list(p.always))
     starts = [friction]
     if p.dof < 3 or not friction:
         starts.append(list(p.always))
     for name in LATE:
+        # The bus that all actuators share, where there is one.
+        own = [item.candidate.index for item in p.items if item.candidate.name == name]
+        first = min(own, default=0)
         options = [
             i
             for i, item in enumerate(p.items)
-            if item.candidate.name == name and item.candidate.index == _first_place(p, name)
+            if item.candidate.name == name and item.candidate.index == first
         ]
         tried = [_friction_beside(p, [*p.always, i]) for i in options]
         best = min(tried, key=p.score, default=friction)
@@ -71,22 +64,14 @@ def _starts(p: Problem) -> list[list[int]]:
     return starts
 
 
-def _first_place(p: Problem, name: str) -> int:
-    """The bus that all actuators share, where there is one."""
-    return min((item.candidate.index for item in p.items if item.candidate.name == name), default=0)
-
-
 def _friction_beside(p: Problem, others: list[int]) -> list[int]:
-    """Viscous and dry friction everywhere; what would drive leaves, the most negative first."""
+    """Viscous and dry friction at all joints, without what would have a negative size."""
     names = (_VISCOUS, _DRY)
-    keys = [i for i, item in enumerate(p.items) if item.candidate.name in names] + others
+    friction = [i for i, item in enumerate(p.items) if item.candidate.name in names]
+    keys = friction + others
     while True:
-        found = p.solve(keys)
-        bad = [
-            i
-            for i in keys
-            if p.items[i].candidate.name in names and p.items[i].columns[0] in found.held
-        ]
+        held = p.solve(keys).held
+        bad = [i for i in keys if i in friction and p.items[i].columns[0] in held]
         if not bad:
             return keys
         keys = [i for i in keys if i not in bad]
@@ -96,13 +81,8 @@ def _friction_beside(p: Problem, others: list[int]) -> list[int]:
 def _climb(p: Problem, keys: list[int], barred: Collection[int] = ()) -> tuple[float, list[int]]:
     """:param barred: items that no set may have"""
     score = p.score(keys)
-    moves: tuple[Callable[[Problem, list[int]], list[list[int]]], ...] = (
-        _add_or_drop,
-        _swap,
-        _at_all_joints,
-    )
     for _ in range(_MOST_MOVES):
-        for move in moves:
+        for move in (_add_or_drop, _swap, _at_all_joints):
             tried = [
                 (p.score(t), t)
                 for t in move(p, keys)
@@ -126,16 +106,14 @@ def _add_or_drop(p: Problem, keys: list[int]) -> list[list[int]]:
 
 def _swap(p: Problem, keys: list[int]) -> list[list[int]]:
     trials = []
-    for i in keys:
-        if i in p.always:
-            continue
+    for i in (i for i in keys if i not in p.always):
         rest = [m for m in keys if m != i]
-        trials += [[*rest, o] for o in p.ranking(rest, swaps(p, keys, i))[:_SWAPPED]]
+        trials += [[*rest, o] for o in p.ranking(rest, substitutes(p, keys, i))[:_SWAPPED]]
     return trials
 
 
 def _at_all_joints(p: Problem, keys: list[int]) -> list[list[int]]:
-    """The same effect everywhere, added, taken away, or exchanged for one that all share."""
+    """The same effect at all joints added, removed, or replaced by one that all actuators share."""
     if p.dof == 1:
         return []
     trials = []
@@ -145,16 +123,15 @@ def _at_all_joints(p: Problem, keys: list[int]) -> list[list[int]]:
         if len(without) < len(keys):
             trials.append(without)
         single = [i for i in every if p.items[i].rule == "linear" and not p.items[i].settings]
-        if len(single) > 1 and p.items[single[0]].candidate.slot != "parameter":
+        if len(single) > 1 and p.items[single[0]].candidate.slot != PARAMETER:
             taken = {p.family(i) for i in without}
-            trials.append(
-                _inside_bounds(p, without, [i for i in single if p.family(i) not in taken])
-            )
+            new = [i for i in single if p.family(i) not in taken]
+            trials.append(_within_bounds(p, without, new))
         trials += [[*without, i] for i in every if p.place(i) == SHARED]
     return trials
 
 
-def _inside_bounds(p: Problem, keys: list[int], new: list[int]) -> list[int]:
+def _within_bounds(p: Problem, keys: list[int], new: list[int]) -> list[int]:
     while new:
         found = p.solve([*keys, *new])
         value = dict(zip(found.free, found.theta, strict=True))
@@ -165,10 +142,10 @@ def _inside_bounds(p: Problem, keys: list[int], new: list[int]) -> list[int]:
     return [*keys, *new]
 
 
-def _shared_instead(p: Problem, keys: list[int]) -> list[int]:
+def _try_shared(p: Problem, keys: list[int]) -> list[int]:
     """
-    Climb again with what all actuators share, such as a late bus, in the place of something at many
-    joints: that is better only once the others have made room.
+    Climb again with an effect that all actuators share, such as a delay of the bus, in place of the
+    same effect at many joints: no single move can make that exchange.
     """
     score = p.score(keys)
     while True:
@@ -188,10 +165,10 @@ def _shared_instead(p: Problem, keys: list[int]) -> list[int]:
         score, keys = new_score, new
 
 
-def _shaken(p: Problem, keys: list[int]) -> list[int]:
+def _retry_without_doubtful(p: Problem, keys: list[int]) -> list[int]:
     """
-    Climb again without one member at a time, the least plausible first: what was added early may
-    stand for two others, and no single move tells.
+    Climb again without one member at a time, the least plausible first: a member that was added
+    early may stand for two others, which no single move can show.
     """
     score, tried = p.score(keys), set()
     for _ in range(_MOST_SHAKEN):

@@ -1,4 +1,4 @@
-"""What the nominal model says of measured motion: one step of the twin from every row."""
+"""The nominal model along measured motion: one step of the twin from every row."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -17,9 +17,9 @@ from sb3_hds.effects import ConstantForce
 
 # Rows that are evaluated at a time: programs are compiled for one shape.
 _ROWS = 1024
-# A force that a machine hardly notices, in shares of what is typical at a joint.
+# Size of the probing force, in shares of the typical force at a joint.
 _PUSH = 1e-3
-# An interval's response to a force may be this many times weaker than the mass matrix alone has it.
+# Largest condition number of the response to a force, relative to that of the mass matrix.
 _STIFFEST = 1e6
 
 
@@ -30,7 +30,7 @@ class Terms(NamedTuple):
     :param change: of the velocity over an interval, as the twin steps, shape ``(n, dof)``
     :param mass: mass matrix where the interval begins, shape ``(n, dof, dof)``
     :param actuator: force of the actuators there, shape ``(n, dof)``
-    :param bias: force that gravity and inertia take there, shape ``(n, dof)``
+    :param bias: force of gravity, Coriolis and centrifugal terms there, shape ``(n, dof)``
     """
 
     change: np.ndarray
@@ -63,10 +63,10 @@ def terms(
         pushed = jnp.asarray(np.zeros(q.shape[1]) if push is None else push, jnp.float64)
         if recorded and _remembers(twin):
             given = (jnp.asarray(x, jnp.float64) for x in (q, v, actions))
-            return Terms(*map(np.asarray, _one_after_the_other(twin, params, pushed, *given)))
+            return Terms(*map(np.asarray, _in_sequence(twin, params, pushed, *given)))
         for index, n in portions(len(q)):
             given = (jnp.asarray(x[index], jnp.float64) for x in (q, v, actions))
-            found = _side_by_side(twin, params, pushed, *given)
+            found = _in_parallel(twin, params, pushed, *given)
             parts.append([np.asarray(leaf)[:n] for leaf in found])
     return Terms(*map(np.concatenate, zip(*parts, strict=True)))
 
@@ -80,15 +80,15 @@ def effective_inertia(
     found: Terms,
 ) -> Float[np.ndarray, "n dof dof"]:
     r"""
-    What a constant force meets over an interval,
+    The inertia that a constant force acts on over an interval,
 
     .. math:: h \left(\frac{\partial\,\Delta v}{\partial f}\right)^{-1}
 
-    The mass matrix, and what damping adds within the interval: where a stiff servo brakes what a
-    force sets in motion, several times as much.
+    It is the mass matrix plus the effect of damping within the interval: several times as much
+    where a stiff servo brakes the motion.
 
     :param found: :func:`terms` of the same rows
-    :return: the mass matrix where the twin's step does not answer to forces
+    :return: the mass matrix where the twin's step does not respond to forces
     """
     plant = plant_of(twin)
     if not isinstance(plant, AnalyticTwin):
@@ -110,7 +110,7 @@ def effective_inertia(
 
 
 def portions(n: int) -> Iterator[tuple[np.ndarray, int]]:
-    """:return: rows, always as many at a time, the last one repeated; and how many of them count"""
+    """:return: indices in portions of equal size, the last one padded, and how many are real"""
     for first in range(0, n, _ROWS):
         yield np.minimum(np.arange(first, first + _ROWS), n - 1), min(_ROWS, n - first)
 
@@ -146,42 +146,33 @@ def _one_step(
     twin: Twin, params: Params, push: Array, state: State, action: Array
 ) -> tuple[State, tuple]:
     plant = plant_of(twin)
-    if isinstance(plant, AnalyticTwin):
-        pushes = [Attached(f"push.{j}", ConstantForce().at(j), j) for j in range(len(push))]
-        sizes = {f"{a.key}.tau_0": push[a.index] for a in pushes}
-        memory = state.memory | {a.key: () for a in pushes}
-        after = twin.step(
-            state._replace(memory=memory), action, params, EffectChain(tuple(pushes), sizes)
-        )
-        after = after._replace(memory={key: after.memory[key] for key in state.memory})
-    else:
-        after = twin.step(state, action, params)
-    if isinstance(plant, AnalyticTwin):
-        found = (
-            plant.mass_matrix(state.q, params),
-            plant.actuate(state, action, params),
-            plant.bias(state.q, state.v, params),
-        )
-    else:
-        still = jnp.zeros_like(state.v)
-        found = jnp.eye(len(state.v), dtype=state.v.dtype), still, still
-    return after, (after.v - state.v, *found)
+    if not isinstance(plant, AnalyticTwin):
+        after, still = twin.step(state, action, params), jnp.zeros_like(state.v)
+        return after, (after.v - state.v, jnp.eye(len(still), dtype=still.dtype), still, still)
+    pushes = [Attached(f"push.{j}", ConstantForce().at(j), j) for j in range(len(push))]
+    sizes = {f"{a.key}.tau_0": push[a.index] for a in pushes}
+    pushed = state._replace(memory=state.memory | {a.key: () for a in pushes})
+    after = twin.step(pushed, action, params, EffectChain(tuple(pushes), sizes))
+    after = after._replace(memory={key: after.memory[key] for key in state.memory})
+    mass = plant.mass_matrix(state.q, params)
+    actuator, bias = plant.actuate(state, action, params), plant.bias(state.q, state.v, params)
+    return after, (after.v - state.v, mass, actuator, bias)
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
-def _side_by_side(
+def _in_parallel(
     twin: Twin, params: Params, push: Array, q: Array, v: Array, actions: Array
 ) -> tuple:
-    nothing = _memory_of(twin, params, q.dtype)
+    nothing = memory_of(twin, params, q.dtype)
     one = lambda q, v, u: _one_step(twin, params, push, State(q, v, nothing), u)[1]  # noqa: E731
     return jax.vmap(one)(q, v, actions)
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
-def _one_after_the_other(
+def _in_sequence(
     twin: Twin, params: Params, push: Array, q: Array, v: Array, actions: Array
 ) -> tuple:
-    obs = twin.observe(State(q[0], v[0], _memory_of(twin, params, q.dtype)), params)
+    obs = twin.observe(State(q[0], v[0], memory_of(twin, params, q.dtype)), params)
     first = twin.infer(obs, params).memory
 
     def advance(memory: dict, row: tuple) -> tuple[dict, tuple]:
@@ -191,7 +182,8 @@ def _one_after_the_other(
     return jax.lax.scan(advance, first, (q, v, actions))[1]
 
 
-def _memory_of(twin: Twin, params: Params, dtype: np.dtype) -> dict:
+def memory_of(twin: Twin, params: Params, dtype: np.dtype) -> dict:
+    """:return: what a twin remembers before a recording begins"""
     obs = jnp.zeros(len(twin.channels), dtype)
     return twin.infer(obs, params).memory
 

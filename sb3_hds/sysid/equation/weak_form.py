@@ -1,9 +1,10 @@
 """
-The equation against test functions: noise of velocities averages out, accelerations are not formed.
+Weak form of the equation of motion: noise of velocities averages out, and no accelerations are
+formed.
 
-The missing force is an impulse for each interval, and the measured velocities in it telescope where
-the mass matrix is constant: multiplied by a smooth bump and summed, only slopes of the bump meet
-their noise. Overlapping bumps are the rows; Huber weights and blocks of data follow.
+The residual force is an impulse for each interval, and the measured velocities in it telescope
+where the mass matrix is constant: multiplied by a smooth bump and summed, only the slopes of the
+bump multiply their noise. Overlapping bumps give the rows, with Huber weights and blocks of data.
 """
 
 import itertools
@@ -15,34 +16,33 @@ from jaxtyping import Float
 from numpy.lib.stride_tricks import sliding_window_view
 
 from sb3_hds.sysid.equation.regression import TINY, Equation, Item
-from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Width of a bump, in periods of the joint's motion, and its least number of intervals.
 _WIDTH, _LEAST = 0.3, 6
-# How often it is halved where there would be too few rows.
+# Number of widths, each half the one before, that are tried where there would be too few rows.
 _NARROWEST = 5
-# Below this share of the root mean square speed, or so many of its errors, a joint is at rest: dry
-# friction is then whatever it has to be, and says nothing. Intervals around a reversal, which
-# smoothing blurs, likewise.
+# Below this share of the root mean square speed, or this many of its errors, a joint is at rest:
+# static friction then takes any value, and such intervals carry no information, nor do those around
+# a reversal, which smoothing blurs.
 _REST, _ERRORS = 0.02, 3.0
 # Where a velocity is below this multiple of what it changes by in an interval, the joint may have
 # stopped in between.
 _STOPS = 1.0
-# Rows per column of the rich model that should be left, and what has to do where a joint rests for
-# this share of the time. Where even that is too much, more stays in (around reversals, then where a
-# joint may have stopped, rest at last) or bumps become shorter than the least.
+# Rows per column of the rich model that should remain, the fallbacks where a joint rests for this
+# share of the time, and half widths shorter than the least. With too few rows, more intervals are
+# kept: around reversals, then where a joint may have stopped, and rest at last.
 _ENOUGH, _OFTEN, _SHORTEST = (4.0, 2.0, 1.0), 0.1, (2, 1)
-# Wider bumps average the noise of the velocities, and cost rows around reversals: so they are wide
-# where this share of what is left is such noise, and narrower by more than the factor only where
-# there is next to none.
+# Wider bumps average the noise of velocities, and cost rows around reversals: bumps are wide where
+# this share of the residual is such noise, and narrower by more than this factor only where there
+# is hardly any.
 _AVERAGED, _NARROW, _NO_NOISE = 0.5, 3.0, 0.05
-# Huber's threshold, in units of the noise, and how often weights are found anew.
+# Huber's threshold, in units of the noise, and number of reweightings.
 _HUBER, _PASSES = 2.0, 4
-# Blocks of data that agree or not: recordings, or pieces of them where they are fewer.
+# Clusters: at least this many recordings, or pieces of them; and folds of held-out data.
 _BLOCKS, _FOLDS = 16, 8
-# How much wider cluster-robust errors may be than naive ones.
+# Largest ratio of cluster-robust to naive variances.
 _MOST_DEFLATION = 10.0
-# What the rich model of the noise leaves out: with it, nothing equals nothing.
+# Effects that the rich model of the noise leaves out: with them, it would fit trivially, 0 = 0.
 _SCALES = ("torque_gain", "directional_gain", "dead_zone", "saturation", "sensor_scale")
 _RANK = 1e-6
 
@@ -71,30 +71,26 @@ class Rows(NamedTuple):
     narrowed: float
 
 
-def weak_rows(equation: Equation) -> list[Rows]:
-    """:return: of each joint"""
-    return [_joint(equation, j) for j in range(equation.missing.shape[1])]
-
-
-def rich_columns(items: list[Item], used: np.ndarray, joint: int | None = None) -> np.ndarray:
+def rich_columns(items: list[Item], used: np.ndarray) -> np.ndarray:
     """
-    :return: places among ``used`` of the columns of a rich linear model, what it leaves being noise
+    :return: places among ``used`` of the columns of a rich linear model, whose residual is noise
     """
     wanted: dict[str, tuple[int, ...]] = {}
     for item in items:
         if item.rule in ("linear", "blend") and item.candidate.name not in _SCALES:
-            # Of what has several settings, the one in the middle stands for all.
+            # The first of several settings stands for all.
             wanted.setdefault(item.key, item.columns)
     columns = {c for cs in wanted.values() for c in cs}
     return np.flatnonzero(np.isin(used, list(columns)))
 
 
-def _joint(equation: Equation, j: int) -> Rows:
+def weak_rows(equation: Equation, j: int) -> Rows:
+    """:return: rows of one joint"""
     columns, motion = equation.columns, equation.motion
-    pairs = [(i, values) for i, c in enumerate(columns) if (values := c.at(j)) is not None]
-    pairs = [(i, values) for i, values in pairs if np.abs(values).max() > 0.0]
-    used = np.array([i for i, _ in pairs], int)
-    table = np.stack([equation.missing[:, j], *(values for _, values in pairs)], 1)
+    acting = {i: values for i, c in enumerate(columns) if (values := c.at(j)) is not None}
+    acting = {i: values for i, values in acting.items() if np.abs(values).max() > 0.0}
+    used = np.array([*acting], int)
+    table = np.stack([equation.missing[:, j], *acting.values()], 1)
     rich = rich_columns(equation.items, used)
     period = motion.period[j] if np.isfinite(motion.period[j]) else 1.0
     widest = max(_WIDTH * period, _LEAST * motion.dt) / (2.0 * motion.dt)
@@ -103,7 +99,7 @@ def _joint(equation: Equation, j: int) -> Rows:
     mass = float(np.median(equation.effective[:, j, j]))
 
     def against(half: int, left_out: np.ndarray) -> Rows:
-        projected, pieces = _against_bumps(table, equation.recording, left_out, half)
+        projected, pieces = _against_bumps(table, equation.rows.recording, left_out, half)
         y, x = projected[:, 0], projected[:, 1:]
         weight, scale = _huber(y, x[:, rich]) if len(y) else (y, 1.0)
         slope = np.linalg.norm(np.diff(_bump(half), prepend=0.0, append=0.0))
@@ -111,7 +107,7 @@ def _joint(equation: Equation, j: int) -> Rows:
             weight * y / scale,
             weight[:, None] * x / scale,
             used,
-            _blocks(pieces, equation.recording),
+            _blocks(pieces, equation.rows.recording),
             scale,
             float(mass * motion.noise_v[j] * slope / motion.dt / scale) if len(y) else 0.0,
             float(_bump(half).sum()),
@@ -121,7 +117,7 @@ def _joint(equation: Equation, j: int) -> Rows:
     def averaged(left_out: np.ndarray, wide: list[int], enough: float) -> Rows | None:
         made = None
         for half in wide:
-            n = sum(map(len, _begins(equation.recording, left_out, half)))
+            n = sum(map(len, _begins(equation.rows.recording, left_out, half)))
             if n <= enough * len(rich):
                 continue
             rows = made = against(half, left_out)
@@ -139,10 +135,10 @@ def _choices(
     equation: Equation, j: int, halves: list[int]
 ) -> Iterator[tuple[np.ndarray, list[int], float]]:
     """
-    :return: intervals to leave out, half widths of bumps, and rows per column that must be left:
-        what is taken first, and what where that leaves too few rows
+    :return: intervals to leave out, half widths of bumps, and rows per column that must remain, in
+        order of preference
     """
-    v, motion = equation.v[:, j], equation.motion
+    v, motion = equation.rows.v[:, j], equation.motion
     slow = np.abs(v) < max(_ERRORS * motion.error_v[j], _REST * motion.speed[j])
     change = np.abs(np.diff(v, append=v[-1:]))
     stops = np.abs(v) < _STOPS * np.maximum(change, np.roll(change, 1))
@@ -168,37 +164,31 @@ def _bump(half: int) -> np.ndarray:
 def _against_bumps(
     table: np.ndarray, recording: np.ndarray, left_out: np.ndarray, half: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """:return: sums against bumps a half width apart, and the middle of each"""
+    """:return: sums against bumps at distances of a half width, and the middle of each"""
     phi = _bump(half)
-    rows, middles = [], []
+    rows, middles = [np.zeros((0, table.shape[1]))], [np.zeros(0, int)]
     for first in _begins(recording, left_out, half):
         stretch = table[first[0] : first[-1] + len(phi)]
         rows.append(sliding_window_view(stretch, len(phi), axis=0)[::half] @ phi)
         middles.append(first + half)
-    if not rows:
-        return np.zeros((0, table.shape[1])), np.zeros(0, int)
     return np.concatenate(rows), np.concatenate(middles)
 
 
 def _begins(recording: np.ndarray, left_out: np.ndarray, half: int) -> list[np.ndarray]:
-    """:return: where bumps begin, by stretch that has room for one"""
+    """:return: where bumps begin, by stretch of one recording that has room for one"""
     length = 2 * half + 1
-    runs = [run for run in _runs(recording, left_out) if run[1] - run[0] >= length]
-    return [np.arange(begin, end - length + 1, half) for begin, end in runs]
-
-
-def _runs(recording: np.ndarray, left_out: np.ndarray) -> list[tuple[int, int]]:
-    """:return: begin and end of stretches of one recording without anything left out"""
     cut = np.flatnonzero(np.diff(recording)) + 1
-    kept = ~left_out
-    edges = np.diff(np.concatenate([[0], kept.astype(int), [0]]))
+    edges = np.diff((~left_out).astype(int), prepend=0, append=0)
     begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    runs = []
+    found = []
     for begin, end in zip(begins, ends, strict=True):
-        inner = cut[(cut > begin) & (cut < end)]
-        bounds = [begin, *inner.tolist(), end]
-        runs += list(itertools.pairwise(bounds))
-    return runs
+        bounds = [begin, *cut[(cut > begin) & (cut < end)].tolist(), end]
+        found += [
+            np.arange(first, last - length + 1, half)
+            for first, last in itertools.pairwise(bounds)
+            if last - first >= length
+        ]
+    return found
 
 
 def _huber(y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, float]:
@@ -238,7 +228,6 @@ class Grams(NamedTuple):
     :param floor: what the noise of velocities alone would leave of each joint's rows, in their unit
     :param scale: noise of a row of each joint [N m] or [N]
     :param gain: by which a constant force is larger in a row of each joint than at an instant
-    :param n_blocks: number of blocks
     """
 
     blocks: np.ndarray
@@ -248,21 +237,18 @@ class Grams(NamedTuple):
     floor: Float[np.ndarray, " dof"]
     scale: Float[np.ndarray, " dof"]
     gain: Float[np.ndarray, " dof"]
-    n_blocks: int
-
-    @property
-    def total(self) -> np.ndarray:
-        return self.by_joint.sum(0)
 
 
-def grams(equation: Equation, rows: list[Rows]) -> Grams:
+def grams(equation: Equation) -> Grams:
     """
-    Blocks that agree less than their rows would: then each row counts as less than one, by the
+    Normal equations of :func:`weak_rows`.
+
+    Where blocks disagree more than independent rows would, each row counts as less than one, by the
     ratio of cluster-robust to naive variances of the rich model's coefficients.
     """
-    n_columns, dof = len(equation.columns), len(rows)
-    pieces = max(1, -(-_BLOCKS // len(np.unique(equation.recording))))
-    n_blocks = (int(equation.recording.max()) + 1) * pieces
+    n_columns, dof = len(equation.columns), equation.missing.shape[1]
+    pieces = max(1, -(-_BLOCKS // len(np.unique(equation.rows.recording))))
+    n_blocks = (int(equation.rows.recording.max()) + 1) * pieces
     blocks = np.zeros((n_blocks, n_columns + 1, n_columns + 1))
     by_joint = np.zeros((dof, n_columns + 1, n_columns + 1))
     n_folds = min(_FOLDS, n_blocks)
@@ -271,7 +257,8 @@ def grams(equation: Equation, rows: list[Rows]) -> Grams:
     folds = np.zeros((n_folds, dof, n_columns + 1, n_columns + 1))
     effective, floor = np.full(dof, 5.0), np.zeros(dof)
     scale, gain = np.ones(dof), np.ones(dof)
-    for j, own in enumerate(rows):
+    for j in range(dof):
+        own = weak_rows(equation, j)
         scale[j], gain[j] = own.scale, own.gain
         if not len(own.y):
             continue
@@ -286,7 +273,7 @@ def grams(equation: Equation, rows: list[Rows]) -> Grams:
             blocks[b][index] += local[b]
             folds[fold_of[b], j][index] += local[b]
         by_joint[j][index] = local.sum(0)
-    return Grams(blocks, by_joint, folds, effective, floor, scale, gain, n_blocks)
+    return Grams(blocks, by_joint, folds, effective, floor, scale, gain)
 
 
 def _deflation(local: np.ndarray, rich: np.ndarray, most: float) -> float:
@@ -306,7 +293,3 @@ def _deflation(local: np.ndarray, rich: np.ndarray, most: float) -> float:
     n = len(local)
     free = n / max(n - int(well.sum()), n / 2)
     return float(np.clip(np.median(ratio) * free, 1.0, most))
-
-
-def is_parameter(item: Item) -> bool:
-    return item.candidate.slot == PARAMETER

@@ -1,5 +1,5 @@
 """
-Parameters from data: windows, shooting, covariance and intervals.
+Parameters from data: windows, multiple shooting, covariance and intervals.
 
-What they leave is learned as a force.
+The residual force is learned by a network.
 """

@@ -1,40 +1,41 @@
 """Estimate the parameters of a twin from measured data."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core import Parameter, Trajectories, Twin
+from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.core.numerics.kept_programs import keep_programs
 from sb3_hds.core.trajectories.episodes import same_interval
 from sb3_hds.data.resampling.report import Reading
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.estimation.covariance import Spread, covariance_of
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.inverse_dynamics import NO_THRESHOLD, Forces, by_inverse_dynamics
-from sb3_hds.sysid.estimation.parameters import Free, free_names, one_each, own_values, tie
+from sb3_hds.sysid.estimation.normal_equations import Uncertainty, covariance_of
+from sb3_hds.sysid.estimation.parameters import Free, free_names, nominal_values, one_each, tie
 from sb3_hds.sysid.estimation.results import Estimate, Fit
 from sb3_hds.sysid.estimation.shooting import Shots, n_free, shots_of
 
 # Length of a window where none is given [s], within these numbers of steps.
 _WINDOW = 0.5
 _SHORTEST, _LONGEST = 5, 50
-# Noise that the first pass assumes, and the least believed, in shares of a channel's spread.
+# Noise that the first pass assumes, and the least noise, in shares of a channel's standard
+# deviation.
 _FIRST_NOISE, _LEAST_NOISE = 0.05, 1e-7
 # Huber's threshold, in units of the noise: 95 % as efficient as least squares on Gaussian noise.
 _HUBER = 1.345
 _PASSES = 3
-# Steps of start states alone. A step that lowers the log likelihood by less is the last: it moves
-# estimates by a fraction of their standard errors.
+# Steps that fit start states alone. The search ends with a step that changes the log likelihood by
+# less than this: it moves estimates by a fraction of their standard errors.
 _FIRST_STEPS, _LEAST_STEP = 8, 1e-3
-# An estimate this close to a bound lies on it, in units of its scale.
+# An estimate this close to a bound counts as on it, in units of its scale.
 _ON_BOUND = 1e-3
-# Beyond this ratio of two intervals, one is taken to be in another unit.
+# From this ratio of two intervals on, one is taken to be in another unit.
 _OTHER_UNIT = 100.0
 
 
@@ -79,8 +80,8 @@ def calibrate(
     :param prior: strength of a normal prior around the twin's own values: the reciprocal of its
         standard deviation, in units of each parameter's ``scale``. 0: no prior.
     :param level: of the confidence intervals
-    :param n_windows: number of windows that are used: a random choice of more, or a compiled
-        program for more than there are; default: all
+    :param n_windows: number of windows: a random choice if there are more, padding if there are
+        fewer, so that one compiled program serves both; default: all
     :param max_steps: of the solver
     :param seed: of the choice of windows
     :return: estimates with standard errors and units, and the calibrated twin
@@ -113,7 +114,7 @@ def calibrate(
         wanted,
         shots,
         origin,
-        spread_of(data),
+        channel_deviations(data),
         threshold=threshold,
         prior=prior,
         level=level,
@@ -127,7 +128,7 @@ def fit_windows(
     free: Free,
     shots: Shots,
     origin: np.ndarray,
-    spread: Float[np.ndarray, " obs"],
+    deviations: Float[np.ndarray, " obs"],
     *,
     threshold: float = _HUBER,
     prior: float = 0.0,
@@ -142,27 +143,34 @@ def fit_windows(
     :param free: parameters, by the name of the value that they take
     :param shots: windows; those of weight zero do not count
     :param origin: recording of each window, shape ``(n,)``
-    :param spread: standard deviation of each channel over the data
+    :param deviations: standard deviation of each channel over the data
     :param threshold: of the Huber loss, in units of the noise
     :param believed: centre of the prior; default: the twin's own values
-    :param elsewhere: another start of the search, used if simulations with the twin's own values
-        err by more than a channel's standard deviation
+    :param elsewhere: computes another start of the search, used if the errors of simulations with
+        the twin's own values exceed a channel's standard deviation
     :raises CalibrationError: for fewer measurements than unknowns
     """
-    _check_enough(twin, free, shots)
     real = origin >= 0
+    n, steps = int(np.sum(shots.weight)), shots.actions.shape[1]
+    measured, unknown = n * int(np.prod(shots.obs.shape[1:])), len(free) + n * n_free(twin)
+    if measured <= unknown:
+        raise CalibrationError(
+            f"{n} windows of {steps} steps hold {measured} measurements, and {len(free)} "
+            f"parameters with the start states are {unknown} unknowns. Record more, free fewer "
+            "parameters, or ask for longer windows."
+        )
     kept, origin = Shots(*(np.asarray(leaf)[real] for leaf in shots)), origin[real]
     evidence = Evidence(
         Hypotheses.of_values(twin, free, believed, prior),
         kept,
-        _FIRST_NOISE * spread,
+        _FIRST_NOISE * deviations,
         width=len(free),
         portion=portion_for(shots.n),
         threshold=threshold,
     )
-    at = evidence.fit(own_values(twin, free), (), n_steps=_FIRST_STEPS)
+    at = evidence.fit(nominal_values(twin, free), (), n_steps=_FIRST_STEPS)
     before, found = at.raw, None
-    if elsewhere is not None and np.any(_rms(before) > spread):
+    if elsewhere is not None and np.any(_rms(before) > deviations):
         other = elsewhere()
         there = other and evidence.fit(other.values, (), n_steps=_FIRST_STEPS)
         if there and there.cost < at.cost:
@@ -170,7 +178,7 @@ def fit_windows(
     for _ in range(_PASSES):
         found = evidence.solve(at.theta, range(len(free)), at.offsets, max_steps, least=_LEAST_STEP)
         at = found.point
-        noise = _noise(at.raw, len(free), n_free(twin), spread)
+        noise = _noise(at.raw, len(free), n_free(twin), deviations)
         evidence = evidence.with_noise(noise)
     assert found is not None
     at = evidence.fit(at.theta, (), at.offsets, n_steps=_FIRST_STEPS)
@@ -179,8 +187,8 @@ def fit_windows(
     uncertainty = covariance_of(
         slopes.curvature.sum(0), slopes.scores, origin, scale, prior, n_measured
     )
-    told = _Told(before, at.raw, noise, found.converged, found.n_steps, "simulation")
-    return _result(twin, free, at.theta, uncertainty, told, level)
+    solver = {"noise": noise, "converged": found.converged, "n_steps": found.n_steps}
+    return _result(twin, free, at.theta, uncertainty, level, (before, at.raw), **solver)
 
 
 def _fit_forces(
@@ -198,11 +206,11 @@ def _fit_forces(
             f"errors='force' asks for the equation of motion of an AnalyticTwin, and {twin.name} "
             "has more than that, or none. Calibrate the twin without effects, or leave errors out."
         )
-    real, spread = origin >= 0, spread_of(data)
+    real, deviations = origin >= 0, channel_deviations(data)
     evidence = Evidence(
         Hypotheses.of_values(twin, free),
         Shots(*(np.asarray(leaf)[real] for leaf in shots)),
-        _FIRST_NOISE * spread,
+        _FIRST_NOISE * deviations,
         width=0,
         portion=portion_for(shots.n),
         threshold=threshold,
@@ -220,11 +228,11 @@ def _fit_forces(
     )
     before, after = (
         evidence.fit(values, (), n_steps=_FIRST_STEPS).raw
-        for values in (own_values(twin, free), found.values)
+        for values in (nominal_values(twin, free), found.values)
     )
-    noise = _noise(after, 0, n_free(twin), spread)
-    told = _Told(before, after, noise, True, 1, "force")
-    return _result(twin, free, found.values, uncertainty, told, level)
+    noise = _noise(after, 0, n_free(twin), deviations)
+    solver = {"noise": noise, "converged": True, "n_steps": 1, "errors": "force"}
+    return _result(twin, free, found.values, uncertainty, level, (before, after), **solver)
 
 
 def _rms(raw: np.ndarray) -> np.ndarray:
@@ -238,11 +246,11 @@ def default_window(data: Trajectories) -> int:
     return min(steps, int(data.lengths.max()))
 
 
-def spread_of(data: Trajectories) -> Float[np.ndarray, " obs"]:
+def channel_deviations(data: Trajectories) -> Float[np.ndarray, " obs"]:
     """:return: standard deviation of each channel over the data, one where it never changes"""
     real = np.concatenate([data.episode(i)[0] for i in range(len(data))])
-    spread = real.std(0)
-    return np.where(spread > 0.0, spread, 1.0)
+    deviations = real.std(0)
+    return np.where(deviations > 0.0, deviations, 1.0)
 
 
 def check_fits(twin: Twin, data: Trajectories) -> None:
@@ -259,119 +267,83 @@ def check_fits(twin: Twin, data: Trajectories) -> None:
     if misfit:
         raise CalibrationError(misfit)
     if not same_interval(data.dt, twin.dt):
+        unit = ""
+        if data.dt / twin.dt >= _OTHER_UNIT:
+            order = int(np.clip(round(np.log10(data.dt / twin.dt) / 3.0), 1, 3))
+            unit = (
+                f"The column of time may be in {('milli', 'micro', 'nano')[order - 1]}seconds: "
+                "then say so in the map of columns, "
+                f"time: {{column: NAME, scale: {10.0 ** (-3 * order):g}}}. Otherwise: "
+            )
         raise CalibrationError(
             f"{twin.name} steps by {twin.dt:g} s and the data are sampled every {data.dt:g} s. "
-            f"{_other_unit(data.dt / twin.dt)}Use data.resample(dt={twin.dt:g}) (in the map of "
+            f"{unit}Use data.resample(dt={twin.dt:g}) (in the map of "
             f"columns, dt: {twin.dt:g}), or make the twin with dt={data.dt:g} (on the command "
             f"line, --set dt:{data.dt:g})."
         )
 
 
-def _other_unit(ratio: float) -> str:
-    """What to do where stamps were taken for seconds that are thousands of times shorter."""
-    if ratio < _OTHER_UNIT:
-        return ""
-    order = int(np.clip(round(np.log10(ratio) / 3.0), 1, 3))
-    unit = ("milliseconds", "microseconds", "nanoseconds")[order - 1]
-    return (
-        f"The column of time may be in {unit}: then say so in the map of columns, "
-        f"time: {{column: NAME, scale: {10.0 ** (-3 * order):g}}}. Otherwise: "
-    )
-
-
-def _check_enough(twin: Twin, free: Free, shots: Shots) -> None:
-    real = int(np.sum(shots.weight))
-    measured = real * int(np.prod(shots.obs.shape[1:]))
-    unknown = len(free) + real * n_free(twin)
-    if measured <= unknown:
-        raise CalibrationError(
-            f"{real} windows of {shots.actions.shape[1]} steps hold {measured} measurements, and "
-            f"{len(free)} parameters with the start states are {unknown} unknowns. "
-            "Record more, free fewer parameters, or ask for longer windows."
-        )
-
-
 def _noise(
-    raw: np.ndarray, n_params: int, n_start: int, spread: np.ndarray
+    raw: np.ndarray, n_params: int, n_start: int, deviations: np.ndarray
 ) -> Float[np.ndarray, " obs"]:
-    """Standard deviation of each channel's error, by the median, so that outliers do not matter."""
+    """Robust standard deviation of each channel's error, from the median."""
     error = raw.reshape(-1, raw.shape[-1])
     freedom = error.size / max(error.size - n_params - n_start * len(raw), 1)
     noise = 1.4826 * np.median(np.abs(error), 0) * np.sqrt(freedom)
-    return np.maximum(noise, _LEAST_NOISE * spread)
-
-
-class _Told(NamedTuple):
-    """What a fit is told with: errors of simulations, shape ``(n, rows, n_obs)``, and the rest."""
-
-    before: np.ndarray
-    after: np.ndarray
-    noise: np.ndarray
-    converged: bool
-    n_steps: int
-    errors: str
+    return np.maximum(noise, _LEAST_NOISE * deviations)
 
 
 def _result(
     twin: Twin,
     free: Free,
     values: np.ndarray,
-    spread: Spread,
-    told: _Told,
+    uncertainty: Uncertainty,
     level: float,
+    raw: tuple[np.ndarray, np.ndarray],
+    **solver: Any,
 ) -> Fit:
+    """
+    :param raw: errors of simulations before and after, each of shape ``(n, rows, n_obs)``
+    :param solver: what :class:`Fit` says of the solver, and the noise
+    """
     groups = tuple(free.values())
-    parameters = [twin.parameters[group[0]] for group in groups]
-    margin = spread.quantile(level) * spread.stderr
-    estimates = tuple(
-        Estimate(
-            name=name,
-            estimate=float(value),
-            stderr=float(stderr),
-            low=float(max(value - half, parameter.lower)),
-            high=float(min(value + half, parameter.upper)),
-            unit=parameter.unit,
-            before=twin.values[group[0]],
-            at_bound=bool(at_bound),
+    margin = uncertainty.quantile(level) * uncertainty.stderr
+    estimates = []
+    for (name, group), x, stderr, half in zip(
+        free.items(), values, uncertainty.stderr, margin, strict=True
+    ):
+        parameter = twin.parameters[group[0]]
+        room = min(x - parameter.lower, parameter.upper - x)
+        estimates.append(
+            Estimate(
+                name=name,
+                estimate=float(x),
+                stderr=float(stderr),
+                low=float(max(x - half, parameter.lower)),
+                high=float(min(x + half, parameter.upper)),
+                unit=parameter.unit,
+                before=twin.values[group[0]],
+                at_bound=bool(room < _ON_BOUND * parameter.scale),
+            )
         )
-        for (name, group), parameter, value, stderr, half, at_bound in zip(
-            free.items(),
-            parameters,
-            values,
-            spread.stderr,
-            margin,
-            _at_bound(parameters, values),
-            strict=True,
-        )
-    )
+    before, after = raw
     return Fit(
         twin=twin.with_parameters(**one_each(groups, values.tolist())),
-        estimates=estimates,
-        covariance=spread.covariance,
+        estimates=tuple(estimates),
+        covariance=uncertainty.covariance,
         channels=tuple((channel.name, channel.unit) for channel in twin.channels),
-        error_before=_rms(told.before),
-        error_after=_rms(told.after),
-        noise=told.noise,
-        n_windows=len(told.after),
-        window=told.after.shape[1] - 1,
-        n_groups=spread.n_groups,
+        error_before=_rms(before),
+        error_after=_rms(after),
+        n_windows=len(after),
+        window=after.shape[1] - 1,
+        n_groups=uncertainty.n_groups,
         level=level,
-        converged=told.converged,
-        n_steps=told.n_steps,
-        undetermined=tuple(_in_words(tuple(free), row) for row in spread.undetermined),
-        errors=told.errors,
+        undetermined=tuple(_combination(tuple(free), row) for row in uncertainty.undetermined),
+        **solver,
     )
 
 
-def _at_bound(parameters: Sequence[Parameter], values: np.ndarray) -> list[bool]:
-    """Whether values lie on a physical bound."""
-    return [
-        bool(min(value - p.lower, p.upper - value) < _ON_BOUND * p.scale)
-        for p, value in zip(parameters, values, strict=True)
-    ]
-
-
-def _in_words(names: tuple[str, ...], direction: np.ndarray) -> str:
-    """Which parameters a direction that the data do not determine consists of."""
+def _combination(names: tuple[str, ...], direction: np.ndarray) -> str:
+    """:return: the parameters that make up an undetermined direction, the largest share first"""
     share = np.abs(direction)
     return ", ".join(names[i] for i in np.argsort(-share) if share[i] > 0.1)

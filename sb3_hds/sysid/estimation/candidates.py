@@ -2,17 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from sb3_hds.core import ActionEffect, Effect, ExtendedTwin, ForceEffect, SensorEffect, Twin
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.effects import (
     ActionDelay,
-    ConstantForce,
     DryFriction,
     NeuralForce,
     SensorDelay,
@@ -20,19 +17,20 @@ from sb3_hds.effects import (
     reversed_joint,
 )
 from sb3_hds.errors import EffectError
+from sb3_hds.sysid.motion.joints import encoders
 
-# Longest delay, in periods of the motion, and the speed below which dry friction is smoothed, in
-# root mean square ones.
+# Longest delay, in periods of the motion; speed below which dry friction is smoothed, in units of
+# the root mean square speed.
 _LATEST, _STANDSTILL = 0.3, 0.01
 
 #: the slot of a twin's own parameter, beside those of effects
 PARAMETER = "parameter"
 
-#: where something acts that all actuators share
+#: place of an effect that all actuators share
 EVERY = "all"
-# What they may share: a bus, a controller.
+# Effects that they may share: those of a bus or a controller.
 _SHARED = ("action_delay", "motor_lag")
-# What a velocity takes over from the position that it is derived from.
+# Effects of an encoder that also act on the velocity derived from it.
 _DERIVED = ("sensor_scale", "sensor_delay")
 _OF_DIRECTION = "The direction of the joint is taken the wrong way round, in position and velocity."
 
@@ -67,6 +65,18 @@ class Candidate:
         """Name and place: unique."""
         return self.name if self.slot == PARAMETER else f"{self.name}.{self.place}"
 
+    @property
+    def full_names(self) -> dict[str, str]:
+        """Full names of its parameters by the short ones; the twin's own have no other name."""
+        if self.slot == PARAMETER:
+            return {self.place: self.place}
+        return {name.rpartition(".")[2]: name for name in self.parameters}
+
+    def moved_to(self, slot: str, place: str, index: int) -> "Candidate":
+        """:return: the same effect at another place"""
+        names = tuple(f"{self.name}.{place}.{short}" for short in self.full_names)
+        return dataclasses.replace(self, slot=slot, place=place, index=index, parameters=names)
+
     def resembles(self, other: "Candidate") -> str:
         """
         :return: when it is indistinguishable from another one, as declared by the effect; empty
@@ -77,7 +87,7 @@ class Candidate:
 
 
 def single_keys(keys: Collection[str], twin: Twin) -> set[str]:
-    """:return: keys of what is attached: of a cause at several places, what is at each"""
+    """:return: keys of single effects: of a candidate at several places, those at each of them"""
     found = set(keys)
     for key in keys:
         name, _, place = key.partition(".")
@@ -88,15 +98,10 @@ def single_keys(keys: Collection[str], twin: Twin) -> set[str]:
     return found
 
 
-def with_pushes(kept: Callable[[type[Effect], str], bool]) -> Callable[[type[Effect], str], bool]:
-    """Constant forces serve to measure what force is missing."""
-    return lambda kind, place: kind is ConstantForce or kept(kind, place)
-
-
 def options_for(
     period: float, speeds: Sequence[float], kind: type[Effect], place: int
 ) -> dict[str, float]:
-    """Scales of the motion in the place of seconds and radians that suit most machines."""
+    """:return: options of an effect that depend on the scales of the motion"""
     if issubclass(kind, ActionDelay | SensorDelay):
         return {"longest": _LATEST * period}
     if issubclass(kind, DryFriction) and len(speeds) and speeds[place] > 0.0:
@@ -110,7 +115,13 @@ def attach(
     kept: Callable[[type[Effect], str], bool],
     options: Callable[[type[Effect], int], dict[str, float]],
 ) -> tuple[Twin, list[Candidate]]:
-    """Every effect that is wanted at every place where it is not already."""
+    """
+    Attach every effect at every place where it is not already.
+
+    :param kept: whether an effect is tried at a place
+    :param options: of an effect at the place of this index
+    :return: the extended twin, and the candidates
+    """
     there = {a.key for a in attached_of(twin)}
     wanted: list[Effect] = []
     places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
@@ -124,41 +135,37 @@ def attach(
             if f"{kind.name}.{place.name}" not in there and kept(kind, place.name):
                 wanted.append(kind(i, **options(kind, i)))
     extended = twin.extend(*wanted) if wanted else twin
-    candidates = []
-    for a in attached_of(extended):
-        if isinstance(a.effect, NeuralForce):
-            continue
-        candidates.append(
-            Candidate(
-                a.effect.name,
-                a.effect.slot,
-                places[a.effect.slot][a.index].name,
-                a.index,
-                tuple(f"{a.key}.{name}" for name in a.effect.parameters),
-                a.effect.explanation,
-                tuple(a.effect.equivalents.items()),
-                tuple(f"{a.key}.{name}" for name in a.effect.ascending),
-            )
+    candidates = [
+        Candidate(
+            a.effect.name,
+            a.effect.slot,
+            places[a.effect.slot][a.index].name,
+            a.index,
+            tuple(f"{a.key}.{name}" for name in a.effect.parameters),
+            a.effect.explanation,
+            tuple(a.effect.equivalents.items()),
+            tuple(f"{a.key}.{name}" for name in a.effect.ascending),
         )
+        for a in attached_of(extended)
+        if not isinstance(a.effect, NeuralForce)
+    ]
     if SignFlip in effects:
         candidates += _reversed_joints(twin)
     return extended, candidates + _shared(twin, candidates)
 
 
 def _shared(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]:
-    """One bus or one power supply behind all actuators: one size for all of them."""
+    """Effects of a bus or a power supply behind all actuators: one size for all of them."""
     found = _of_encoders(twin, candidates)
     for name in _SHARED:
         own = [c for c in candidates if c.name == name and c.slot == "actuator"]
         if len(own) > 1 and len(own) == len(twin.actuators):
-            tie = f"{name}.{EVERY}"
-            names = tuple(f"{tie}.{p.rpartition('.')[2]}" for p in own[0].parameters)
-            found.append(dataclasses.replace(own[0], place=EVERY, index=-1, parameters=names))
+            found.append(own[0].moved_to("actuator", EVERY, -1))
     return found
 
 
 def _of_encoders(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]:
-    """What is wrong with a sensor is wrong with the velocity, too, that is derived from it."""
+    """Errors of an encoder that act on its position and on the velocity derived from it."""
     found = []
     for j, encoder in encoders(twin).items():
         for name in _DERIVED:
@@ -166,77 +173,28 @@ def _of_encoders(twin: Twin, candidates: Sequence[Candidate]) -> list[Candidate]
             if encoder.velocity is None or not {*encoder.channels} <= {c.index for c in own}:
                 continue
             (first,) = (c for c in own if c.index == encoder.position)
-            place = twin.joints[j].name
-            names = tuple(f"{name}.{place}.{p.rpartition('.')[2]}" for p in first.parameters)
-            found.append(
-                dataclasses.replace(first, slot="joint", place=place, index=j, parameters=names)
-            )
-    return found
-
-
-class Encoder(NamedTuple):
-    """
-    :param position: index of the channel that reports a joint's position
-    :param velocity: of the one that reports its velocity; None if there is none
-    """
-
-    position: int
-    velocity: int | None
-
-    @property
-    def channels(self) -> tuple[int, ...]:
-        """Indices of all channels that it feeds."""
-        return (self.position,) if self.velocity is None else (self.position, self.velocity)
-
-
-def encoders(twin: Twin) -> dict[int, Encoder]:
-    """:return: by joint, where channels are positions and velocities themselves"""
-    twin = plant_of(twin)
-    dof = len(twin.joints)
-    state = twin.initial(jax.random.key(0), twin.params)
-    if state.q.shape != (dof,):
-        return {}
-
-    def seen(x: jax.Array) -> jax.Array:
-        return twin.observe(state._replace(q=x[:dof], v=x[dof:]), twin.params)
-
-    here = jnp.concatenate([0.3 + 0.1 * jnp.arange(dof), 0.7 - 0.1 * jnp.arange(dof)])
-    slopes, values = np.asarray(jax.jacfwd(seen)(here)), np.asarray(seen(here))
-    unit = np.abs(np.abs(slopes).sum(1) - 1.0) < 1e-6
-    found = {}
-    for j in range(dof):
-        places = [
-            [
-                i
-                for i in np.flatnonzero(unit)
-                if np.isclose(slopes[i, k], 1.0) and np.isclose(values[i], here[k], atol=1e-5)
-            ]
-            for k in (j, dof + j)
-        ]
-        if len(places[0]) == 1 and len(places[1]) <= 1:
-            velocity = int(places[1][0]) if places[1] else None
-            found[j] = Encoder(int(places[0][0]), velocity)
+            found.append(first.moved_to("joint", twin.joints[j].name, j))
     return found
 
 
 def ties_of(
     twin: Twin, candidates: Sequence[Candidate], single: Sequence[Candidate]
 ) -> dict[str, tuple[str, ...]]:
-    """:return: by the name of a shared number, the parameters that take it"""
+    """:return: by the name of a shared value, the parameters that take it"""
     found = {}
     for shared in candidates:
         if shared.place == EVERY:
-            own = [c for c in single if c.name == shared.name and c.slot == "actuator"]
-            own = [c for c in own if c.place != EVERY]
+            slot, where = "actuator", {actuator.name for actuator in twin.actuators}
         elif shared.slot == "joint" and shared.name in _DERIVED:
             channels = encoders(twin)[shared.index].channels
-            own = [c for c in single if c.name == shared.name and c.slot == "channel"]
-            own = [c for c in own if c.index in channels]
+            slot, where = "channel", {twin.channels[i].name for i in channels}
         else:
             continue
-        for name in shared.parameters:
-            short = name.rpartition(".")[2]
-            found[name] = tuple(f"{c.key}.{short}" for c in own)
+        own = [
+            c.key for c in single if (c.name, c.slot) == (shared.name, slot) and c.place in where
+        ]
+        for short, name in shared.full_names.items():
+            found[name] = tuple(f"{key}.{short}" for key in own)
     return found
 
 
@@ -255,14 +213,15 @@ def _reversed_joints(twin: Twin) -> list[Candidate]:
 
 
 def has_memory(effect: Effect, twin: Twin) -> bool:
+    """:return: whether it remembers earlier states, commands or readings"""
     if isinstance(effect, SensorEffect):
         return bool(jax.tree.leaves(effect.memory(jnp.zeros(()), twin)))
-    return isinstance(effect, ForceEffect | ActionEffect) and bool(
-        jax.tree.leaves(effect.memory(twin))
-    )
+    acts = isinstance(effect, ForceEffect | ActionEffect)
+    return acts and bool(jax.tree.leaves(effect.memory(twin)))
 
 
 def attached_of(twin: Twin) -> tuple:
+    """:return: effects with their places; none of a twin that is not extended"""
     layer = extended_of(twin)
     return layer.attached if layer else ()
 

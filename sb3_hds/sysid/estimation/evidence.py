@@ -1,11 +1,11 @@
-"""Fits of hypotheses to windows of data: multiple shooting, by one compiled program for all."""
+"""Multiple shooting: fit hypotheses to windows of data, all by one compiled program."""
 
 import dataclasses
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
@@ -25,30 +25,26 @@ from sb3_hds.sysid.estimation.normal_equations import (
     eliminate_starts,
     normal_equations,
 )
-from sb3_hds.sysid.estimation.shooting import (
-    Shots,
-    first_offsets,
-    n_steps_of,
-    simulate,
-    with_slopes,
-)
+from sb3_hds.sysid.estimation.shooting import Shots, n_steps_of, simulate, with_slopes
+from sb3_hds.sysid.motion.joints import first_offsets
 
-# Beyond this, in units of the noise, an error counts in proportion, not by its square.
+# Threshold of Huber's loss, in units of the noise.
 _HUBER = 3.0
 # Damping of the first step, relative to the curvature, how it changes, and where it ends.
 _DAMPING, _LESS, _MORE, _MOST_DAMPING = 1e-3, 0.2, 8.0, 1e6
 # A step that lowers the cost by a smaller share than this is the last.
 _ENOUGH = 1e-4
-# Steps after which a fit that has to beat another ends if its cost is so many times as large. Of 49
-# such fits on two machines of two joints, none came closer by more than a factor of 3.6 after its
-# third step, and those that did better than the other had 1.2 times its cost by then, or less.
+# Steps after which a fit that has to beat another is given up if its cost is this many times
+# larger. Of 49 such fits on two machines of two joints, none came closer by more than a factor of
+# 3.6 after its third step, and those that did better than the other had 1.2 times its cost by then,
+# or less.
 _HOPELESS = ((3, 30.0), (8, 5.0))
-# Most windows that are simulated at a time, and of what their number is a multiple.
+# Most windows that are simulated at a time, and the number of which theirs is a multiple.
 _PORTION, _ROUND = 64, 8
 # Steps of all windows, or joints, beyond which a second program, for start states alone, is worth
 # compiling: 8 s for one joint with all its effects, as 50 passes over so many steps take.
 _MANY_STEPS, _MANY_JOINTS = 60_000, 3
-# Held by programs that must not run beside another one.
+# Held by programs that call LAPACK, which must not run beside one another.
 _LAPACK = threading.Lock()
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
@@ -111,8 +107,7 @@ class Evidence:
     :param width: most parameters that move at a time
     :param rows: whether a row of a window counts, shape ``(steps + 1,)``; default: all do
     :param portion: windows that are simulated at a time: one program serves data of every size
-    :param threshold: beyond which an error counts in proportion, not by its square, in units of the
-        noise
+    :param threshold: of Huber's loss, in units of the noise
     """
 
     hypotheses: Hypotheses
@@ -160,7 +155,7 @@ class Evidence:
         :param n_steps: at most
         :param enough: a step that lowers the cost by a smaller share than this is the last
         :param least: so is one that lowers it by less than this
-        :param rival: the cost to come below: a fit that stays far above it is given up
+        :param rival: cost of the fit to beat: one that stays far above it is given up
         """
         h, moving = self.hypotheses, np.array(free, int)
         low, high, size = h.lower[moving], h.upper[moving], h.scale[moving]
@@ -180,7 +175,7 @@ class Evidence:
             ahead = offsets + step.from_score + step.from_step @ z
             then = self._blocks(new, moving, ahead)
             if not len(moving):
-                # Start states of different windows have nothing to do with each other.
+                # Start states of different windows are independent.
                 better = then.cost < now.cost
                 gained = np.sum((now.cost - then.cost)[better])
                 offsets = np.where(better[:, None], ahead, offsets)
@@ -234,17 +229,13 @@ class Evidence:
             return first_offsets(h.twin, np.asarray(self.shots.obs, float), h.twin.dt, params)
 
     @cached_property
-    def _counted(self) -> np.ndarray:
-        return np.ones(self.shots.obs.shape[1]) if self.rows is None else self.rows
-
-    @cached_property
     def _most_known(self) -> int:
         """Of all windows, the most steps that were recorded before one."""
         return int(np.asarray(self.shots.lead_known).sum(1).max(initial=0.0))
 
     @cached_property
     def _portions(self) -> list[tuple[Shots, slice]]:
-        """Windows, some at a time, the last ones filled up."""
+        """Windows, some at a time, the last ones padded."""
         found = []
         with jax.enable_x64(True):
             for first in range(0, self.shots.n, self.portion):
@@ -253,16 +244,11 @@ class Evidence:
                 found.append((portion, slice(first, min(first + self.portion, self.shots.n))))
         return found
 
-    def _width_for(self, index: np.ndarray) -> int:
-        n, rows = self.shots.obs.shape[:2]
-        large = len(self.hypotheses.twin.joints) > _MANY_JOINTS
-        return 0 if not len(index) and (large or n * rows > _MANY_STEPS) else self.width
-
     def _lead_under(self, theta: np.ndarray, index: np.ndarray) -> int:
         """:return: steps before a window in which memory must be filled under these parameters"""
         h = self.hypotheses
         active = theta != h.null
-        # What is absent remembers nothing, but its slope may need the last few commands.
+        # An effect at its null needs no memory, but its slope may need the last few commands.
         begins = np.where(active, h.forgets, np.minimum(h.forgets, Effect.forgets * h.period))
         active[index] = True
         longest = max(h.always, float(begins[active].max(initial=0.0)))
@@ -284,10 +270,13 @@ class Evidence:
         h, n_lead = self.hypotheses, self._lead_under(theta, index)
         filled = np.zeros((self.portion, offsets.shape[1]))
         filled[:n] = offsets
-        slopes = []
-        for own in _in_groups(index, self._width_for(index), len(theta)):
-            with jax.enable_x64(True), _alone(len(h.twin.joints)):
-                found = _look(
+        n_steps = self.shots.obs[..., 0].size
+        large = len(h.twin.joints) > _MANY_JOINTS or n_steps > _MANY_STEPS
+        width, slopes = 0 if large and not len(index) else self.width, []
+        for own in _in_groups(index, width, len(theta)):
+            alone = _LAPACK if uses_lapack(len(h.twin.joints)) else nullcontext()
+            with jax.enable_x64(True), alone:
+                found = _errors_and_slopes(
                     h.twin,
                     h.names,
                     tuple(h.ties.items()),
@@ -304,17 +293,13 @@ class Evidence:
             raw, by_start, by_theta = found
             slopes.append(by_theta)
         by_theta = np.concatenate(slopes, -1)[..., : len(index)]
-        return normal_equations(raw, by_start, by_theta, self.noise, self._counted, self.threshold)
-
-
-def _alone(n: int) -> AbstractContextManager:
-    """For programs that solve matrices of so many rows."""
-    return _LAPACK if uses_lapack(n) else nullcontext()
+        counted = np.ones(raw.shape[1]) if self.rows is None else self.rows
+        return normal_equations(raw, by_start, by_theta, self.noise, counted, self.threshold)
 
 
 def in_threads(work: Callable[[_Given], _Told], given: Sequence[_Given]) -> Iterator[_Told]:
     """
-    As ``map``. Compiled programs leave the interpreter free, so threads share the cores.
+    Like ``map``, in threads: compiled programs release the interpreter lock.
     """
     if len(given) == 1:
         yield work(given[0])
@@ -324,14 +309,14 @@ def in_threads(work: Callable[[_Given], _Told], given: Sequence[_Given]) -> Iter
 
 
 def _in_groups(index: np.ndarray, width: int, nothing: int) -> Iterator[np.ndarray]:
-    """Indices, so many at a time, the last ones filled up by one that names nothing."""
+    """Indices, ``width`` at a time, the last ones padded with ``nothing``."""
     for first in range(0, max(len(index), 1), max(width, 1)):
         own = index[first : first + width]
         yield np.concatenate([own, np.full(width - len(own), nothing)])
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICK_COMPILATION)
-def _look(
+def _errors_and_slopes(
     twin: Twin,
     names: tuple[str, ...],
     ties: tuple[tuple[str, tuple[str, ...]], ...],
@@ -345,9 +330,9 @@ def _look(
     chosen: Chosen | None,
 ) -> tuple[Array, Array, Array]:
     """
-    :param ties: parameters that share one number, by the name of that number
-    :param n_lead: steps before each window that matter to what is remembered
-    :param chosen: the effects that may do something under these parameters; None: all
+    :param ties: parameters that share one value, by the name of that value
+    :param n_lead: steps before each window that fill the memory
+    :param chosen: the effects that may be active under these parameters; None: all
     :return: simulated minus measured, and its slopes by start state and by the parameters that
         ``index`` names (in units of their scale)
     """
@@ -355,7 +340,7 @@ def _look(
 
     def one(offset: Array, shot: Shots) -> tuple[Array, Array, Array]:
         def of(both: Array) -> Array:
-            # The last place takes what belongs to no parameter.
+            # The last place takes the padding.
             step = jnp.zeros(len(names) + 1, theta.dtype).at[index].set(both[n:])
             values = theta + scale * step[:-1]
             params = fixed | {name: values[i] for i, name in enumerate(names)}

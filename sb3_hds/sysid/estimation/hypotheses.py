@@ -1,4 +1,4 @@
-"""All hypotheses in one model: every candidate attached, each switched on by its parameters."""
+"""All hypotheses in one model: every candidate is attached, and its parameters switch it on."""
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
@@ -25,31 +25,32 @@ from sb3_hds.sysid.estimation.candidates import (
     options_for,
     single_keys,
     ties_of,
-    with_pushes,
 )
 from sb3_hds.sysid.estimation.parameters import Belief, Free, prior_of
 from sb3_hds.sysid.estimation.shooting import remembered_for, remembers_for
+
+_OF_PARAMETER = "The twin's {} is not that of the system."
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hypotheses:
     """
-    A twin with every candidate attached, all at the value at which they change nothing.
+    A twin with every candidate attached, all at the values at which they have no effect.
 
     :param believed: nominal model
     :param twin: extended by all effects
-    :param candidates: what may be named
-    :param names: all parameters that may move, nuisances first
-    :param null: their values when nothing is wrong, shape ``(p,)``
+    :param candidates: causes that may be named
+    :param names: all parameters that may be fitted, nuisances first
+    :param null: their values under the nominal model, shape ``(p,)``
     :param scale: their typical deviations from it
     :param lower: smallest admissible values
     :param upper: largest admissible values
     :param nuisances: indices of those that are refitted under every hypothesis
     :param prior: standard deviation of the prior of each nuisance around its value in ``null``;
         infinite for all other parameters
-    :param pushes: index of a constant force at each joint, to measure what force is missing
+    :param pushes: index of a constant force at each joint, to measure the residual force
     :param nameless: flexible forces: never a finding, but findings have to beat them
-    :param ties: parameters of which one number is shared, by the name of that number
+    :param ties: parameters that share one value, by the name of that value
     :param period: of the motion [s]
     :param starts: for candidates by key, values by full name at which a search may begin
     """
@@ -86,7 +87,7 @@ class Hypotheses:
         :param effects: classes that are tried at every place
         :param only: keys of the candidates that are kept; default: all
         :param nameless_at: joints at which flexible forces are tried; default: all
-        :param period: of the motion [s]: what is later than a third of it is no delay
+        :param period: of the motion [s]: delays are at most 0.3 of it
         :param speeds: root mean square velocity of each joint, in which dry friction is smoothed;
             default: as the effects have it
         :param calibrate: nuisance parameters, which are no findings; see
@@ -102,18 +103,16 @@ class Hypotheses:
                 f"calibrate names {', '.join(unknown)}, which {twin.name} does not have. "
                 f"Its parameters are: {', '.join(twin.parameters) or 'none'}."
             )
-        own = tuple(name for name in twin.parameters if not name.endswith(".share"))
-        known = twin.known_parameters
         pushed = () if ConstantForce in effects else (ConstantForce,)
         rivals = tuple(kind for kind in NAMELESS if kind not in effects)
         wanted = None if only is None else single_keys(only, twin)
-        kept = lambda kind, place: (  # noqa: E731
-            (nameless_at is None or place in nameless_at)
-            if kind in rivals
-            else wanted is None or kind in pushed or f"{kind.name}.{place}" in wanted
-        )
-        if wanted is not None and ConstantForce in effects:
-            kept = with_pushes(kept)
+
+        def kept(kind: type[Effect], place: str) -> bool:
+            if kind in rivals:
+                return nameless_at is None or place in nameless_at
+            # Constant forces serve to measure the residual force.
+            return wanted is None or kind is ConstantForce or f"{kind.name}.{place}" in wanted
+
         options = partial(options_for, period, speeds)
         extended, found = attach(twin, (*effects, *pushed, *rivals), kept, options)
         nameless = tuple(c for c in found if c.name in {kind.name for kind in rivals})
@@ -125,8 +124,8 @@ class Hypotheses:
         there = {name for c in found for name in c.parameters}
         candidates = [
             Candidate(f"parameter.{name}", PARAMETER, name, i, (name,), _OF_PARAMETER.format(name))
-            for i, name in enumerate(own)
-            if name not in {*calibrate, *native.values(), *there, *known}
+            for i, name in enumerate(n for n in twin.parameters if not n.endswith(".share"))
+            if name not in {*calibrate, *native.values(), *there, *twin.known_parameters}
         ]
         candidates += [
             c
@@ -143,16 +142,14 @@ class Hypotheses:
         values = np.array([extended.values[ties.get(name, (name,))[0]] for name in moving], float)
         lower = np.array([every[name].lower for name in moving], float)
         for i, name in enumerate(moving):
-            if name in native:
-                # The twin has some of it already: there may be less than it believes.
-                target = native[name]
-                if every[name].null == 0.0:
-                    lower[i] = twin.parameters[target].lower - twin.values[target]
+            if name in native and every[name].null == 0.0:
+                # The twin has some of it already, and the truth may be less.
+                lower[i] = twin.parameters[native[name]].lower - twin.values[native[name]]
         upper = np.array([every[name].upper for name in moving], float)
         prior = np.full(len(moving), np.inf)
         for i, (name, belief) in enumerate(beliefs.items()):
-            own_prior = prior_of(name, twin.parameters[name], twin.values[name], belief)
-            prior[i], lower[i], upper[i] = own_prior
+            own = twin.parameters[name], twin.values[name]
+            prior[i], lower[i], upper[i] = prior_of(name, *own, belief)
         return cls(
             believed=twin,
             twin=extended,
@@ -224,7 +221,7 @@ class Hypotheses:
         return np.array([found.get(self._single(name), 0.0) for name in self.names])
 
     def parameter(self, name: str) -> Parameter:
-        """:return: unit, scale and bounds of a parameter, or of a number that several share"""
+        """:return: unit, scale and bounds of a parameter, or of a value that several share"""
         return self.twin.parameters[self._single(name)]
 
     def _single(self, name: str) -> str:
@@ -233,9 +230,9 @@ class Hypotheses:
     def chosen(self, theta: Float[np.ndarray, " p"], index: Int[np.ndarray, " k"]) -> Chosen | None:
         """
         :param theta: all parameters, shape ``(p,)``
-        :param index: of those by which slopes are taken; others than parameters name nothing
-        :return: the effects that are not null, or whose slopes are asked for; None for all, where
-            there is no candidate
+        :param index: of those by which slopes are taken; indices beyond them are padding
+        :return: the effects that are not null, or whose slopes are taken; None for all, where there
+            is no candidate
         """
         if not self.candidates:
             return None
@@ -253,18 +250,18 @@ class Hypotheses:
 
     @cached_property
     def always(self) -> float:
-        """:return: the same for what the nominal model remembers [s]"""
+        """:return: after how long the memory of the nominal model is forgotten [s]"""
         return remembered_for(self.believed, self.period)
 
     def effect_of(self, candidate: Candidate) -> Effect | None:
         """:return: the effect that the candidate is; None for a parameter, or several effects"""
         shared = bool({*candidate.parameters} & {*self.ties})
-        found = [
+        found = (
             a.effect
             for a in attached_of(self.twin)
             if a.key == candidate.key or (shared and a.effect.name == candidate.name)
-        ]
-        return found[0] if found else None
+        )
+        return next(found, None)
 
     def remembers(self, candidate: Candidate) -> bool:
         """:return: whether it has memory of earlier states or commands"""
@@ -313,7 +310,7 @@ class Hypotheses:
         singles = [single for name in names for single in self.ties.get(name, (name,))]
         own = {self.names[i]: value[self.names[i]] for i in self.nuisances}
         native = native_targets(self.believed, chosen)
-        for name in (name for c in chosen for name in c.parameters):
+        for name in names:
             if name in native:
                 own[native[name]] = with_native(
                     self.believed.values[native[name]], value[name], self.twin.parameters[name]
@@ -335,6 +332,3 @@ class Hypotheses:
     def place_of(self, candidate: Candidate) -> dict[str, str | int]:
         """:return: where it is, as plain data"""
         return {"slot": candidate.slot, "index": candidate.index, "name": candidate.place}
-
-
-_OF_PARAMETER = "The twin's {} is not that of the system."

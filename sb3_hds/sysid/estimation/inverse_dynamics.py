@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 
 from sb3_hds.core import AnalyticTwin, State, Trajectories, Twin
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
-from sb3_hds.sysid.equation.motion import motion
 from sb3_hds.sysid.estimation.parameters import one_each
+from sb3_hds.sysid.motion.motion import motion
 
 # Gauss-Newton steps: most parameters are linear, and need one; Huber's weights need a few.
 _STEPS = 6
@@ -20,16 +20,16 @@ _HUBER = 1.345
 #: for plain squares: beyond any error, in units of the noise
 NO_THRESHOLD = 1e12
 _NORMAL = 1.4826
-# How firmly the twin's own values are believed, as a standard deviation in each parameter's scale:
-# enough to keep what the data do not tell.
+# Standard deviation of the prior around the twin's own values, in each parameter's scale: a weak
+# prior that keeps what the data do not determine.
 _BELIEF = 100.0
 
 
 class Forces(NamedTuple):
     """
     :param values: of the free parameters, within their bounds
-    :param errors: forces that are missing at these values, in units of their noise, weighted by
-        Huber's rule, shape ``(n, dof)``
+    :param errors: residual forces at these values, in units of their noise, weighted by Huber's
+        rule, shape ``(n, dof)``
     :param slopes: of these by the parameters, shape ``(n, dof, p)``
     :param recording: that each row is from, shape ``(n,)``
     :param every: samples of the data between two rows
@@ -42,7 +42,7 @@ class Forces(NamedTuple):
     every: int
 
     def windows(self, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """:return: errors, slopes and recording of pieces of so many samples"""
+        """:return: errors, slopes and recording of windows of this many samples"""
         rows = max(1, steps // self.every)
         places = []
         for one in np.unique(self.recording):
@@ -63,9 +63,9 @@ def by_inverse_dynamics(
 
     .. math:: M(q)\,\dot v + c(q, v) - \tau(q, v, u)
 
-    Nothing is integrated, so it converges where simulations with wrong values diverge, and it is
-    the better estimator if torques are less certain than sensors, as on a geared arm. Velocity
-    noise biases it towards zero.
+    Nothing is integrated, so it converges where simulations with wrong values diverge. It is the
+    better estimator if torques are less certain than sensors, as on a geared arm. Velocity noise
+    biases estimates towards zero.
 
     Source: Khalil and Dombre, *Modeling, Identification and Control of Robots*, 2002, section 12.
 
@@ -96,7 +96,7 @@ def by_inverse_dynamics(
             errors, table = weight * missing, weight[..., None] * slopes
             if step == _STEPS:
                 break
-            belief = np.diag(np.full(len(groups), 1.0 / _BELIEF))
+            belief = np.eye(len(groups)) / _BELIEF
             whole = np.concatenate([table.reshape(-1, len(groups)) * scale, belief])
             right = np.concatenate([-errors.ravel(), (own - values) / scale / _BELIEF])
             room = (lower - values) / scale, (upper - values) / scale
@@ -105,17 +105,15 @@ def by_inverse_dynamics(
 
 
 def _weights(missing: np.ndarray, threshold: float) -> np.ndarray:
-    noise = _NORMAL * np.median(np.abs(missing), 0)
-    noise = np.maximum(noise, 1e-12 * np.abs(missing).max() + 1e-300)
-    return np.sqrt(np.minimum(1.0, threshold * noise / np.maximum(np.abs(missing), 1e-300))) / noise
+    size = np.abs(missing)
+    noise = np.maximum(_NORMAL * np.median(size, 0), 1e-12 * size.max() + 1e-300)
+    return np.sqrt(np.minimum(1.0, threshold * noise / np.maximum(size, 1e-300))) / noise
 
 
 def _within(table: np.ndarray, right: np.ndarray, room: tuple[np.ndarray, np.ndarray]) -> Any:
-    """Least squares between bounds, of which one that stands on the other leaves no room."""
+    """Bounded least squares; a parameter whose bounds coincide stays where it is."""
     low, high = room
-    fixed = high - low < 1e-12
-    found = np.zeros(len(low))
-    free = ~fixed
+    found, free = np.zeros(len(low)), high - low >= 1e-12
     if free.any():
         found[free] = scipy.optimize.lsq_linear(table[:, free], right, (low[free], high[free])).x
     return found

@@ -14,7 +14,7 @@ from sb3_hds.errors import CalibrationError
 
 #: parameters, by the name of the value that they take: mostly one, by its own name
 Free = Mapping[str, tuple[str, ...]]
-# A value that is off by more than this factor belongs to another machine, or to a wrong model.
+# A value that is wrong by more than this factor belongs to another machine or a wrong model.
 _FACTOR = 20.0
 # Least standard deviation of a prior, as a share of the value.
 _SHARE = 0.2
@@ -47,7 +47,7 @@ def free_names(twin: Twin, free: Iterable[str] | None) -> tuple[str, ...]:
     return names
 
 
-def each(names: Iterable[str]) -> Free:
+def untied(names: Iterable[str]) -> Free:
     """:return: every parameter by itself"""
     return {name: (name,) for name in names}
 
@@ -85,7 +85,7 @@ def _alike(twin: Twin, name: str) -> tuple[str, float, float, float]:
     return parameter.unit, parameter.lower, parameter.upper, twin.values[name]
 
 
-def own_values(twin: Twin, free: Free) -> Float[np.ndarray, " p"]:
+def nominal_values(twin: Twin, free: Free) -> Float[np.ndarray, " p"]:
     """:return: what the twin has for them"""
     return np.array([twin.values[members[0]] for members in free.values()], float)
 
@@ -112,8 +112,8 @@ def prior_of(name: str, parameter: Parameter, value: float, belief: Belief = Non
     The prior of a parameter that is refitted.
 
     Its standard deviation is the parameter's ``scale``, in proportion to the value where that is
-    larger than the parameter's null, and a fifth of the value at least. Where nothing else is said,
-    a value that is not zero stays within a factor of 20.
+    larger than the parameter's null, and at least a fifth of the value. By default, a value other
+    than zero stays within a factor of 20.
 
     :param name: of the parameter, for messages
     :param parameter: unit, scale and bounds
@@ -144,8 +144,8 @@ def prior_of(name: str, parameter: Parameter, value: float, belief: Belief = Non
 
 def limits_of(parameter: Parameter, value: float) -> tuple[float, float]:
     """
-    :return: within a factor of 20 of the value, unless the parameter is bounded more closely; what
-        may as well not be there, such as friction, may vanish
+    :return: bounds within a factor of 20 of the value, or those of the parameter if they are
+        tighter; a parameter whose null is zero, such as friction, may vanish
     """
     if value == 0.0:
         return parameter.lower, parameter.upper
@@ -159,8 +159,8 @@ def limits_of(parameter: Parameter, value: float) -> tuple[float, float]:
 
 def at_limit(value: float, lower: float, upper: float, believed: float) -> bool:
     """
-    :return: whether a refitted value stands at a bound that is neither zero (a machine without
-        friction, a load that is not there) nor where it was believed to be
+    :return: whether a refitted value is at a bound that is neither zero (a machine without friction
+        or load) nor its nominal value
     """
     reach = 1e-6 * max(abs(lower if math.isfinite(lower) else 0.0), abs(value), 1e-300)
     near = [bound for bound in (lower, upper) if abs(value - bound) <= reach]

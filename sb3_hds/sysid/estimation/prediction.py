@@ -16,11 +16,11 @@ from sb3_hds.sysid.estimation.shooting import Shots, fit_start, n_free, simulate
 
 # Gauss-Newton steps of a start state.
 _N_STEPS = 8
-# Better is what lowers the error by this share, at this level, judged by so many samples.
+# Least gain that counts as better, its level, and the number of bootstrap samples.
 _LEAST_GAIN, _LEVEL, _N_BOOTSTRAP = 0.05, 0.05, 1000
-# The first recording that may be held out as a whole, and how many of its windows at most.
+# The first recording that may be held out entirely, and the most windows of it.
 _FIRST_WHOLE, _LONG = 3, 32
-# What `has_grown` asks for.
+# Ratio of errors from which they count as grown, and the level of the test.
 _GROWN, _GROWN_LEVEL = 1.5, 1e-4
 
 
@@ -28,43 +28,46 @@ def window_errors(
     twin: Twin, params: Params, shots: Shots, scale: Float[np.ndarray, " obs"]
 ) -> Float[np.ndarray, " n"]:
     """
-    Root mean square error of each window, from the start state that suits the twin best. So the
-    noise of the first measurement does not count, and neither does a bias of the twin that moving
-    the start can hide.
+    Root mean square error of each window, from the start state that fits the twin best: the noise
+    of the first measurement does not count, nor does a bias of the twin that another start can
+    hide.
 
     :param params: full parameters of the twin
     :param shots: windows
     :param scale: what an error of one means in each channel
     :return: errors in units of ``scale``, shape ``(n,)``; infinite where a simulation is not finite
     """
-    with jax.enable_x64(True):
-        doubles = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
-        found = _errors(twin, doubles, Shots(*map(jnp.asarray, shots)), jnp.asarray(scale))[0]
-        return np.asarray(found)
+    return _in_double_precision(twin, params, shots, scale)[0]
 
 
 def start_states(
     twin: Twin, params: Params, shots: Shots, scale: Float[np.ndarray, " obs"]
 ) -> tuple[Float[np.ndarray, "n free"], Float[np.ndarray, "n residuals free"]]:
     """
-    :return: of each window, the start state under which the twin comes closest to it, and an
-        orthonormal basis of the errors (in units of ``scale``, flattened) that moving it can make
+    :return: the start state that fits the twin best to each window, and an orthonormal basis of the
+        errors (in units of ``scale``, flattened) that moving it can cause
     """
+    _, offsets, slopes = _in_double_precision(twin, params, shots, scale)
+    return offsets, np.linalg.qr(np.nan_to_num(slopes, posinf=0.0, neginf=0.0))[0]
+
+
+def _in_double_precision(
+    twin: Twin, params: Params, shots: Shots, scale: Float[np.ndarray, " obs"]
+) -> tuple[np.ndarray, ...]:
     with jax.enable_x64(True):
         doubles = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
         found = _errors(twin, doubles, Shots(*map(jnp.asarray, shots)), jnp.asarray(scale))
-        slopes = np.nan_to_num(np.asarray(found[2]), posinf=0.0, neginf=0.0)
-        return np.asarray(found[1]), np.linalg.qr(slopes)[0]
+        return tuple(map(np.asarray, found))
 
 
 def single_step_errors(
     twin: Twin, data: Trajectories, scale: Float[np.ndarray, " obs"], n_rows: int
 ) -> Float[np.ndarray, " n"]:
     """
-    Errors of single steps from measured states: quick to compile, and enough to see that a twin is
-    exact. Where measurements are noisy, or states not fully observed, they say little.
+    Errors of single steps from measured states: quick to compile, and enough to show that a twin is
+    exact. They mean little where measurements are noisy or states are not fully observed.
 
-    :param n_rows: the latest steps are looked at, so many; where there are fewer, some count twice
+    :param n_rows: number of steps, the latest ones; where there are fewer, some count twice
     :return: root mean square over the channels of each step, in units of ``scale``
     """
     episodes = [data.episode(i) for i in range(len(data))]
@@ -84,18 +87,15 @@ def gain(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"]) -> float:
     return float(1.0 - np.sqrt(np.divide(*squares)))
 
 
-def is_better(
-    new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], least: float = _LEAST_GAIN
-) -> bool:
+def is_better(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"]) -> bool:
     """
     Whether the errors of held-out windows are significantly lower: also in 95 % of bootstrap
     samples of the windows.
 
     :param new: errors of each window
     :param old: errors of the same windows
-    :param least: the gain that counts
     """
-    if len(new) < 2 or not gain(new, old) >= least:
+    if len(new) < 2 or not gain(new, old) >= _LEAST_GAIN:
         return False
     lower = np.clip(old, 1e-9, 1e9) ** 2 - np.clip(new, 1e-9, 1e9) ** 2
     drawn = np.random.default_rng(0).integers(len(lower), size=(_N_BOOTSTRAP, len(lower)))
@@ -104,9 +104,8 @@ def is_better(
 
 def has_grown(latest: Float[np.ndarray, " n"], older: Float[np.ndarray, " m"]) -> bool:
     """
-    Whether the system is no longer the one that it was: errors of the latest windows are half as
-    large again as those of older ones, beyond chance (one-sided Welch test on the logarithms, at a
-    level that allows for looking often).
+    Whether the system has changed: errors of the latest windows are 1.5 times those of older ones,
+    significantly (one-sided Welch test on the logarithms, at a level for repeated tests).
     """
     new, old = (np.log(np.clip(errors, 1e-9, 1e9)) for errors in (latest, older))
     test: Any = scipy.stats.ttest_ind(new, old, equal_var=False, alternative="greater")
@@ -115,7 +114,7 @@ def has_grown(latest: Float[np.ndarray, " n"], older: Float[np.ndarray, " m"]) -
 
 def probability_before(fit: Fit, believed: Twin) -> float:
     """
-    Prior predictive check: the prior probability of values at least as far from the nominal ones.
+    Prior predictive check: prior probability of values at least as far from the nominal ones.
 
     Source: Box, J. R. Stat. Soc. A 143, 1980 (a prior is checked by its predictive distribution).
 
@@ -130,12 +129,12 @@ def probability_before(fit: Fit, believed: Twin) -> float:
 
 def hold_out(number: np.ndarray, place: np.ndarray, share: float = 0.25) -> np.ndarray:
     """
-    Which windows are kept from learning: whole recordings where there are at least four, otherwise
-    stretches of each; of a recording that goes on for long, stretches from there on.
+    Which windows are held out from training: entire recordings if there are at least four,
+    otherwise stretches of each; of a long recording, stretches from its 32nd window on.
 
-    What was learned from is never held out later: not when more has come, for the first three
-    recordings are not held out as a whole; not when old windows are left out, since numbers and
-    places stay; and not when the share becomes smaller, as long as it is halved.
+    A window used for training is never held out later: not when recordings are added, since the
+    first three are never held out entirely; not when old windows are dropped, since numbers and
+    places stay; and not when the share is halved.
 
     :param number: of each window's recording, counted from the first there ever was; -1 for
         padding, shape ``(n,)``

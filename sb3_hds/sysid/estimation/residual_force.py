@@ -1,4 +1,4 @@
-"""Learn the force that a twin lacks: an ensemble, on errors over several steps."""
+"""Learn the residual force of a twin: an ensemble of networks, on errors over several steps."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,24 +15,24 @@ from sb3_hds.core import AnalyticTwin, Params, State, Trajectories, TransformedT
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.effects import NeuralForce, force_of
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.estimation.calibrate import check_fits, default_window, spread_of
+from sb3_hds.sysid.estimation.calibrate import channel_deviations, check_fits, default_window
 from sb3_hds.sysid.estimation.prediction import hold_out, is_better, start_states, window_errors
 from sb3_hds.sysid.estimation.shooting import Shots, places_of, shots_of, simulate
 
-# Share of a channel's spread that an error of one means, where its noise is not known.
+# Unit of errors where the noise is not known, in standard deviations of a channel.
 _UNIT_ERROR = 0.05
-# Share of the typical inertial force that an output of one means.
+# Unit of the output, in shares of the typical inertial force.
 _OUTPUT = 0.3
 _LEARNING_RATE, _WEIGHT_DECAY = 1e-2, 1e-3
 _BATCH = 32
-# One in so many of the windows to learn from is kept for early stopping.
+# Every n-th training window is a validation window, for early stopping.
 _EVERY = 4
-# Steps between two looks at those windows; after this many looks without gain it stops.
+# Steps between two validations; training stops after this many without gain.
 _CHUNK, _PATIENCE = 50, 6
 _MOST_CHUNKS = 40
-# How often start states are found again, with the force as learned, and learning goes on.
+# Rounds of training; between them, start states are refitted with the force as learned.
 _ROUNDS = 2
-# Beyond this, in units of the channels' scale, an error counts in proportion, not by its square.
+# Threshold of Huber's loss, in units of the channels' scale.
 _OUTLIER = 3.0
 
 
@@ -93,13 +93,13 @@ def fit_residual(
     seed: int = 0,
 ) -> Residual:
     """
-    Attach a learned force to a twin, and keep it only if held-out windows say that it helps.
+    Attach a learned force to a twin, and keep it only if it lowers the errors of held-out windows.
 
-    Each member of the ensemble sees a bootstrap sample of the windows and stops where a quarter of
-    them, kept aside, gets no better. Further windows, seen by neither, decide whether the force is
-    kept. The loss is the error over whole windows, so the force is learned where
-    the simulation goes, and through the integrator that will use it. A force that the twin has
-    already goes on from its weights.
+    Each member of the ensemble trains on a bootstrap sample of the windows, and stops when the
+    errors of validation windows, a quarter of them, stop falling. Further windows, used for
+    neither, decide whether the force is kept. The loss is the error over entire windows, so the
+    force is learned along the simulation and through the integrator that will use it. A force that
+    the twin has already continues from its weights.
 
     :param twin: analytic, extended or not; its values stay as they are
     :param data: measured trajectories, sampled at the twin's ``dt``
@@ -108,15 +108,15 @@ def fit_residual(
     :param caution: see :class:`~sb3_hds.effects.NeuralForce`
     :param window: steps per window; default as for ``calibrate``
     :param noise: standard deviation of each channel's noise, for example ``fit.noise``; default: a
-        twentieth of its spread
+        twentieth of the channel's standard deviation
     :param n_windows: fixed number of windows, see ``calibrate``
     :param seed: of weights, bootstrap and batches
     :raises CalibrationError: for a twin without mass matrix, other channels or another interval
     :raises TrajectoryError: if no recording is as long as a window
     """
     check_fits(twin, data)
-    spread = spread_of(data)
-    scale = _UNIT_ERROR * spread if noise is None else np.maximum(noise, 1e-3 * spread)
+    deviations = channel_deviations(data)
+    scale = _UNIT_ERROR * deviations if noise is None else np.maximum(noise, 1e-3 * deviations)
     length = window or default_window(data)
     shots, origin = shots_of(data, length, twin, n_windows, seed)
     rank = np.where(origin < 0, -1, np.searchsorted(np.unique(data.origin), origin))
@@ -147,7 +147,7 @@ def fit_force(
     :func:`fit_residual` on windows that were cut already.
 
     :param shots: windows; those of weight zero do not count
-    :param held: which are kept from learning, shape ``(n,)``
+    :param held: which windows are held out from training, shape ``(n,)``
     :param scale: what an error of one means in each channel
     :raises CalibrationError: for a twin without mass matrix, or too few windows
     """
@@ -163,12 +163,18 @@ def fit_force(
             f"{real.sum()} windows are too few to learn from some and check on others. "
             "Record more, or ask for shorter windows."
         )
-    has_force = force_of(twin) is not None
-    extended, key = _with_force(twin, n_members, net_arch, caution)
+    extended = twin
+    if force_of(twin) is None:
+        fresh = NeuralForce(0, n_members=n_members, net_arch=net_arch, caution=caution)
+        extended = twin.extend(fresh)
+    attached = force_of(extended)
+    assert attached is not None
+    key, force = attached
     without = {**extended.params, f"{key}.share": 0.0}
-    tensors = _own(extended, key)
-    if not has_force:
-        tensors = _normalised(extended, key, shots, learned, seed)
+    seen = _seen(extended, Shots(*(leaf[learned] for leaf in shots)))
+    tensors = {name: extended.tensors[f"{key}.{name}"] for name in force.tensors}
+    if extended is not twin:
+        tensors = _normalised(extended, force, seen, seed)
     params, n_steps = without, 0
     for _ in range(_ROUNDS):
         starts = start_states(extended, params, shots, scale)
@@ -180,32 +186,9 @@ def fit_force(
     after = window_errors(extended, params, shots, scale)[held]
     accepted = is_better(after, before)
     extended = extended.with_parameters(**{f"{key}.share": 1.0 if accepted else 0.0})
-    doubt = _mean_disagreement(extended, key, shots, learned)
+    disagree = lambda q, v, u: force.disagreement(q, v, u, tensors)  # noqa: E731
+    doubt = float(jnp.mean(jax.vmap(jax.vmap(disagree))(*seen)))
     return Residual(extended, key, accepted, before, after, n_steps, doubt)
-
-
-def _with_force(
-    twin: Twin, n_members: int, net_arch: Sequence[int], caution: float
-) -> tuple[Twin, str]:
-    if force_of(twin) is None:
-        twin = twin.extend(NeuralForce(0, n_members=n_members, net_arch=net_arch, caution=caution))
-    found = force_of(twin)
-    assert found is not None
-    return twin, found[0]
-
-
-def _command(twin: Twin, state: State, action: Array, params: dict[str, Any]) -> Array:
-    """What the plant is told, below the wrappers."""
-    for layer in layers_of(twin):
-        if isinstance(layer, TransformedTwin):
-            action = layer.command(state, action, params)
-    return action
-
-
-def _own(twin: Twin, key: str) -> dict[str, Any]:
-    found = force_of(twin)
-    assert found is not None
-    return {name: twin.tensors[f"{key}.{name}"] for name in found[1].tensors}
 
 
 def _seen(twin: Twin, shots: Shots) -> tuple[Array, Array, Array]:
@@ -215,7 +198,10 @@ def _seen(twin: Twin, shots: Shots) -> tuple[Array, Array, Array]:
 
     def one(obs: Array, action: Array) -> tuple[Array, Array, Array]:
         state: State = twin.infer(obs, params)
-        force = plant.actuate(state, _command(twin, state, action, params), params)
+        for layer in layers_of(twin):
+            if isinstance(layer, TransformedTwin):
+                action = layer.command(state, action, params)
+        force = plant.actuate(state, action, params)
         return plant.coordinates(state.q), state.v, force
 
     obs = jnp.asarray(shots.obs[:, :-1], jnp.float32)
@@ -223,22 +209,19 @@ def _seen(twin: Twin, shots: Shots) -> tuple[Array, Array, Array]:
 
 
 def _normalised(
-    twin: Twin, key: str, shots: Shots, learned: np.ndarray, seed: int
+    twin: Twin, force: NeuralForce, seen: tuple[Array, Array, Array], seed: int
 ) -> dict[str, Any]:
     """Random weights with the scales of the data."""
-    found, plant = force_of(twin), plant_of(twin)
-    assert found is not None and isinstance(plant, AnalyticTwin)
-    rows = Shots(*(leaf[learned] for leaf in shots))
-    q, v, actuator = _seen(twin, rows)
-    inputs = jax.vmap(jax.vmap(found[1].inputs))(q, v, actuator)
+    plant, (q, v, actuator) = plant_of(twin), seen
+    assert isinstance(plant, AnalyticTwin)
+    inputs = jax.vmap(jax.vmap(force.inputs))(q, v, actuator)
     inputs = inputs.reshape(-1, inputs.shape[-1])
     scale = jnp.std(inputs, 0)
     masses = jax.vmap(jax.vmap(lambda q: jnp.diag(plant.mass_matrix(q, twin.params))))(q)
     pushed = masses[:, :-1] * jnp.diff(v, axis=1) / twin.dt
     inertial = jnp.median(jnp.abs(pushed), (0, 1)) * 1.4826
     size = jnp.where(inertial > 0.0, _OUTPUT * inertial, 1.0)
-    fresh = found[1].fresh(jax.random.key(seed))
-    return fresh | {
+    return force.fresh(jax.random.key(seed)) | {
         "input_mean": jnp.mean(inputs, 0),
         "input_scale": jnp.where(scale > 1e-6, scale, 1.0),
         "output_scale": size,
@@ -248,7 +231,7 @@ def _normalised(
 def _train(
     twin: Twin, key: str, lesson: Lesson, learned: np.ndarray, n_members: int, seed: int
 ) -> tuple[dict[str, Any], int]:
-    """Adam on each member by itself, stopped where windows that it does not see get no better."""
+    """Adam on each member separately, with early stopping on validation windows."""
     rows = np.flatnonzero(learned)
     watched = np.isin(
         np.arange(len(learned)), rows[_EVERY - 1 :: _EVERY] if len(rows) >= _EVERY else rows[-1:]
@@ -257,12 +240,12 @@ def _train(
     weights = single.scales.pop("weights")
     drawn = np.random.default_rng(seed).exponential(size=(n_members, len(learned)))
     drawn *= learned & ~watched
-    chances = jnp.asarray(drawn / drawn.sum(1, keepdims=True), jnp.float32)
+    probabilities = jnp.asarray(drawn / drawn.sum(1, keepdims=True), jnp.float32)
     state = jax.vmap(_optimiser().init)(weights)
     loss_of = lambda w: np.asarray(_watched_loss(twin, key, w, single, jnp.asarray(watched)))  # noqa: E731
     best, best_loss, idle, n_chunks = weights, loss_of(weights), 0, 0
     for k in jax.random.split(jax.random.key(seed), _MOST_CHUNKS):
-        weights, state = _steps(twin, key, weights, state, single, chances, k)
+        weights, state = _steps(twin, key, weights, state, single, probabilities, k)
         loss = loss_of(weights)
         n_chunks += 1
         better = loss < best_loss
@@ -293,7 +276,7 @@ def _steps(
     weights: Any,
     state: Any,
     lesson: Lesson,
-    chances: Float[Array, "members n"],
+    probabilities: Float[Array, "members n"],
     rng: Array,
 ) -> tuple[Any, Any]:
     optimiser = _optimiser()
@@ -302,8 +285,8 @@ def _steps(
         picked, at = jax.tree.map(lambda leaf: leaf[rows], (lesson.shots, lesson.starts))
         return jnp.mean(jax.vmap(partial(_error, twin, key, lesson, own))(picked, at))
 
-    def member(own: Any, state: Any, chance: Array, rng: Array) -> tuple[Any, Any]:
-        rows = jax.random.choice(rng, len(chance), (_BATCH,), p=chance)
+    def member(own: Any, state: Any, probability: Array, rng: Array) -> tuple[Any, Any]:
+        rows = jax.random.choice(rng, len(probability), (_BATCH,), p=probability)
         gradient = jax.grad(loss)(own, rows)
         finite = jnp.all(jnp.array([jnp.isfinite(g).all() for g in jax.tree.leaves(gradient)]))
         gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
@@ -311,9 +294,9 @@ def _steps(
         return optax.apply_updates(own, change), state
 
     def step(carry: Any, rng: Array) -> tuple[Any, None]:
-        keys = jax.random.split(rng, chances.shape[0])
+        keys = jax.random.split(rng, probabilities.shape[0])
         weights, state = carry
-        return jax.vmap(member)(weights, state, chances, keys), None
+        return jax.vmap(member)(weights, state, probabilities, keys), None
 
     return jax.lax.scan(step, (weights, state), jax.random.split(rng, _CHUNK))[0]
 
@@ -338,9 +321,9 @@ def _error(
     start: tuple[Numbers, Numbers],
 ) -> Array:
     """
-    Loss of one window under one member, as if the ensemble were that member alone. What moving the
-    start state could undo does not count: otherwise start states that suit the twin without the
-    force would hide much of what it has to do.
+    Loss of one window under one member, as if the ensemble were that member alone. Errors that
+    moving the start state could undo are projected out: otherwise start states fitted without the
+    force would hide much of what it has to learn.
     """
     offset, basis = start
     alone = jax.tree.map(lambda leaf: leaf[None], own)
@@ -351,12 +334,3 @@ def _error(
     size = jnp.abs(error - basis @ (basis.T @ error))
     small = jnp.minimum(size, _OUTLIER)
     return jnp.mean(0.5 * small**2 + _OUTLIER * (size - small))
-
-
-def _mean_disagreement(twin: Twin, key: str, shots: Shots, learned: np.ndarray) -> float:
-    found = force_of(twin)
-    assert found is not None
-    own = _own(twin, key)
-    rows = Shots(*(leaf[learned] for leaf in shots))
-    disagree = lambda q, v, u: found[1].disagreement(q, v, u, own)  # noqa: E731
-    return float(jnp.mean(jax.vmap(jax.vmap(disagree))(*_seen(twin, rows))))

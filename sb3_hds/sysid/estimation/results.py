@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -25,7 +26,8 @@ class Estimate:
     :param unit: of all of these
     :param before: value with which the search began
     :param at_bound: whether the estimate lies on a physical bound; standard errors mean little then
-    :param added_to: what the twin has of it already, to which the estimate is added, in ``unit``
+    :param added_to: value that the twin has of it already, to which the estimate is added, in
+        ``unit``
     """
 
     name: str
@@ -45,7 +47,7 @@ class Fit:
     Result of :func:`~sb3_hds.sysid.calibrate`.
 
     :param twin: with the estimated values
-    :param estimates: one for each free parameter, in the order asked for
+    :param estimates: one for each free parameter, in the order given
     :param covariance: of the estimates, shape ``(p, p)``
     :param channels: name and unit of each observation
     :param error_before: root mean square error of each channel over the windows, with the values
@@ -56,8 +58,8 @@ class Fit:
     :param window: steps of each
     :param n_groups: independent clusters: recordings, or windows
     :param level: of the confidence intervals
-    :param converged: whether the solver says so
-    :param n_steps: that it took
+    :param converged: whether the solver converged
+    :param n_steps: of the solver
     :param undetermined: groups of parameters of which the data determine only combinations
     :param errors: that were minimised: ``"simulation"`` or ``"force"``
     """
@@ -85,12 +87,10 @@ class Fit:
 
     def __getitem__(self, name: str) -> Estimate:
         """:raises KeyError: for a parameter that was not free"""
-        for estimate in self.estimates:
-            if estimate.name == name:
-                return estimate
-        raise KeyError(
-            f"'{name}' was not free. Estimated were: {', '.join(e.name for e in self.estimates)}."
-        )
+        by_name = {estimate.name: estimate for estimate in self.estimates}
+        if name not in by_name:
+            raise KeyError(f"'{name}' was not free. Estimated were: {', '.join(by_name)}.")
+        return by_name[name]
 
     @property
     def caveats(self) -> tuple[str, ...]:
@@ -112,29 +112,15 @@ class Fit:
 
     def to_dict(self) -> dict[str, Any]:
         """:return: plain data, ready for JSON; what is not finite is None"""
-        return {
-            "twin": self.twin.name,
-            "estimates": plain(self.estimates),
-            "covariance": plain(self.covariance),
-            "channels": [
-                plain({"name": name, "unit": unit, "before": b, "after": a, "noise": n})
-                for (name, unit), b, a, n in zip(
-                    self.channels,
-                    self.error_before.tolist(),
-                    self.error_after.tolist(),
-                    self.noise.tolist(),
-                    strict=True,
-                )
-            ],
-            "n_windows": self.n_windows,
-            "window": self.window,
-            "n_groups": self.n_groups,
-            "level": self.level,
-            "errors": self.errors,
-            "converged": self.converged,
-            "n_steps": self.n_steps,
-            "caveats": list(self.caveats),
-        }
+        errors = zip(self.error_before, self.error_after, self.noise, strict=True)
+        channels = [
+            {"name": name, "unit": unit, "before": before, "after": after, "noise": noise}
+            for (name, unit), (before, after, noise) in zip(self.channels, errors, strict=True)
+        ]
+        told = {"twin": self.twin.name, "estimates": self.estimates, "covariance": self.covariance}
+        told |= {"channels": channels}
+        others = ("n_windows", "window", "n_groups", "level", "errors", "converged", "n_steps")
+        return plain(told | {name: getattr(self, name) for name in (*others, "caveats")})
 
     def __repr__(self) -> str:
         share = f"{100.0 * self.level:g} %"
@@ -157,7 +143,7 @@ class Fit:
             before = f"{b:.3g}" if math.isfinite(b) else "diverges"
             lines.append(f"{name:<{w}}{before:>16}{a:>12.3g}{n:>12.3g} {unit}")
         for caveat in self.caveats:
-            lines += ["", *_wrapped(caveat)]
+            lines += ["", *textwrap.wrap(caveat, _WIDTH)]
         return "\n".join(lines)
 
     def plot(self, path: Any) -> None:
@@ -182,9 +168,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _wrapped(text: str) -> list[str]:
-    import textwrap
-
-    return textwrap.wrap(text, _WIDTH)

@@ -1,8 +1,8 @@
 """
 Multiple shooting: measured data in short windows, each simulated from a start state of its own.
 
-Short windows keep a chaotic or unstable system from drowning the parameters in its sensitivity, and
-free start states keep the noise of one measurement from spoiling a whole window.
+Short windows limit the sensitivity of a chaotic or unstable system to its start, and free start
+states keep the noise of one measurement from biasing an entire window.
 """
 
 from collections.abc import Callable
@@ -27,22 +27,17 @@ from sb3_hds.core import (
     Twin,
     solve_spd,
 )
-from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import layers_of
 from sb3_hds.errors import TrajectoryError
 
-# Error that stands for a simulation that is not finite, in units of the noise.
+# Error of a simulation that is not finite, in units of the noise.
 _NOT_FINITE = 1e6
 # Added to the normal equations of a start state, relative to their diagonal.
 _DAMPING = 1e-9
-# For how long before a window memory of unknown kind, as of a wrapper, is filled, in periods of the
-# motion.
+# Time before a window in which memory of unknown kind, as of a wrapper, is filled, in periods of
+# the motion.
 _LEAD = Effect.forgets
 Offset = Float[Array, " tangent"]
-# Samples from which the first velocity is told.
-_FEW = 5
-# Rows before and after each other.
-_PAIRS = (slice(None, -1), slice(1, None))
 
 
 class Shots(NamedTuple):
@@ -71,7 +66,7 @@ class Shots(NamedTuple):
 
 
 def evenly(n: int, most: int) -> np.ndarray:
-    """:return: so many of ``n`` indices, at equal distances; all where there are no more"""
+    """:return: ``most`` of ``n`` indices, equally spaced; all of them if there are fewer"""
     return np.arange(n) if n <= most else np.round(np.linspace(0, n - 1, most)).astype(int)
 
 
@@ -88,9 +83,9 @@ def shots_of(
 
     :param data: trajectories sampled at the twin's ``dt``
     :param length: steps of a window
-    :param twin: says whether commands before a window matter, because something remembers them
-    :param n_rows: fixed number of rows: a random choice of more windows, or padding of fewer. A
-        compiled program then serves again when more data have come.
+    :param twin: determines how many commands before a window matter, because the twin has memory
+    :param n_rows: fixed number of rows: a random choice of more windows, or padding of fewer, so
+        that a compiled program is reused when data are added
     :param seed: of that choice; None takes the latest windows instead
     :param period: of the motion [s], in which the twin's memory forgets
     :return: the windows, in order of recording and time, and for each the recording that it is
@@ -146,7 +141,7 @@ def _windows_in(data: Trajectories, length: int) -> list[tuple[int, int]]:
 
 
 def _chosen(n_windows: int, n_rows: int, seed: int | None) -> np.ndarray:
-    """Which of the windows there is room for, in their order."""
+    """:return: indices of the windows that are used, in order"""
     if n_windows <= n_rows:
         return np.arange(n_windows)
     if seed is None:
@@ -163,11 +158,11 @@ def simulate(
     effects: EffectChain = NO_EFFECTS,
 ) -> Float[Array, "rows obs"]:
     """
-    Commands before the window fill what the twin remembers: the motion is measured there.
+    Simulate one window; measured motion and commands before it fill the twin's memory.
 
     :param shot: one window
-    :param offset: of the start state from what the first measurement says, as a tangent vector of
-        positions and velocities
+    :param offset: of the start state from the first measurement, as a tangent vector of positions
+        and velocities
     :param n_lead: how many of the steps before the window are simulated, the last ones; default:
         all. Where it is given, only forward derivatives can be taken.
     :param effects: besides those of the twin, or which of them are computed
@@ -182,7 +177,7 @@ def simulate(
         state, simulated = now
         place = i - lead
         seen = twin.infer(obs[i], params)
-        seen = _moved(twin, seen, jnp.where(place == 0, offset, 0.0))
+        seen = moved_by(twin, seen, jnp.where(place == 0, offset, 0.0))
         q, v = (jnp.where(place > 0, *pair) for pair in zip(state[:2], seen[:2], strict=True))
         state = State(q, v, state.memory)
         after = twin.step(state, actions[i], params, effects)
@@ -200,7 +195,7 @@ def simulate(
 
 
 def n_free(twin: Twin) -> int:
-    """:return: numbers that a start state has: positions and velocities"""
+    """:return: dimension of a start state: positions and velocities"""
     return 2 * len(twin.joints)
 
 
@@ -238,8 +233,8 @@ def fit_start(
     n_iterations: int,
 ) -> Offset:
     """
-    The start state under which the twin comes closest to one window: Gauss-Newton steps, each of
-    which is taken only if it brings the simulation closer.
+    Fit the start state of one window by Gauss-Newton steps, each of which is taken only if it
+    lowers the error.
 
     :param first: where to begin
     :return: the offset, without derivative
@@ -251,7 +246,7 @@ def fit_start(
     def improve(_: Array, offset: Offset) -> Offset:
         now, slopes = with_slopes(error, offset)
         step = -solve_normal(slopes, now)
-        # Half a step is tried too: far from the optimum a whole one often goes too far.
+        # Half a step is tried too: far from the optimum, a full one often overshoots.
         candidates = jnp.stack([offset, offset + 0.5 * step, offset + step])
         costs = jax.vmap(lambda x: jnp.sum(error(x) ** 2))(candidates)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
@@ -263,14 +258,28 @@ def fit_start(
 def solve_normal(slopes: Array, right: Array) -> Array:
     """
     :return: least-squares solution of ``slopes @ x = right`` by the normal equations, which are
-        tiny; a direction without slope is left alone
+        tiny; zero along a direction without slope
     """
     normal = slopes.T @ slopes
     normal = normal + (_DAMPING * jnp.trace(normal) + 1e-300) * jnp.eye(normal.shape[0])
     return solve_spd(normal, slopes.T @ right)
 
 
-def _moved(twin: Twin, state: State, offset: Offset) -> State:
+def eliminate_start(errors: Array, slopes: Array, n: int) -> tuple[Array, Array, Array]:
+    """
+    :param errors: of a window
+    :param slopes: by ``n`` parameters, then by the start state
+    :return: errors and slopes by the parameters, start state eliminated, and how it follows both
+    """
+    by_theta, by_start = slopes[:, :n], slopes[:, n:]
+    both = jnp.concatenate([errors[:, None], by_theta], 1)
+    moves = jax.vmap(partial(solve_normal, by_start), 1, 1)(both)
+    free = both - by_start @ moves
+    return free[:, 0], free[:, 1:], moves
+
+
+def moved_by(twin: Twin, state: State, offset: Offset) -> State:
+    """:return: the state with positions and velocities moved along a tangent vector"""
     rest = ravel_pytree(state.memory)[0]
     return twin.retract(state, jnp.concatenate([offset, jnp.zeros_like(rest)]))
 
@@ -278,7 +287,7 @@ def _moved(twin: Twin, state: State, offset: Offset) -> State:
 def remembered_for(twin: Twin, period: float = 1.0) -> float:
     """
     :param period: of the motion [s]
-    :return: how long before a window what the twin remembers may have begun to differ [s]
+    :return: time before a window that the twin's memory depends on [s]
     """
     obs = jnp.zeros(len(twin.channels))
     memory = jax.eval_shape(lambda: twin.infer(obs, twin.params).memory)
@@ -295,7 +304,7 @@ def remembered_for(twin: Twin, period: float = 1.0) -> float:
 
 
 def remembers_for(effect: Effect, period: float) -> float:
-    """:return: how long an effect's memory tells how it began [s]"""
+    """:return: time after which an effect's memory has forgotten its start [s]"""
     return getattr(effect, "longest", effect.forgets * period)
 
 
@@ -316,56 +325,3 @@ def _cut(data: Trajectories, i: int, k: int, length: int, lead: int) -> Shots:
         known.astype(float),
         np.ones(()),
     )
-
-
-def motion_of(
-    twin: Twin, obs: Float[np.ndarray, "n rows obs"], dt: float, params: Params | None = None
-) -> tuple[Float[np.ndarray, "n rows dof"], Float[np.ndarray, "n rows dof"]]:
-    """
-    :param obs: measurements in a row, every ``dt`` [s]
-    :param params: under which they are read; default: the twin's own
-    :return: positions, and velocities; where no velocity is observed, differences of positions
-    """
-    q, v, ways = _read(twin, obs, twin.params if params is None else params)
-    if q.shape[1] > 1 and not v.any():
-        v = _rates(ways, dt)
-    return q, v
-
-
-def first_offsets(
-    twin: Twin, obs: Float[np.ndarray, "n rows n_obs"], dt: float, params: Params | None = None
-) -> Float[np.ndarray, "n free"]:
-    """
-    Where a search for start states begins.
-
-    :param params: under which measurements are read; default: the twin's own
-    :return: offsets from what first measurements say: zero, but for velocities that are not
-        observed, which differences of positions tell
-    """
-    q, v, ways = _read(twin, obs[:, :_FEW], twin.params if params is None else params)
-    v = np.zeros_like(q) if v[:, 0].any() else _rates(ways, dt)
-    return np.concatenate([np.zeros_like(q[:, 0]), v.mean(1)], 1)
-
-
-def _rates(ways: Float[np.ndarray, "n ways dof"], dt: float) -> Float[np.ndarray, "n rows dof"]:
-    """Differences over two steps, over one at the ends."""
-    rates = ways / dt
-    inside = 0.5 * (rates[:, 1:] + rates[:, :-1])
-    return np.concatenate([rates[:, :1], inside, rates[:, -1:]], 1)
-
-
-def _read(twin: Twin, obs: np.ndarray, params: Params) -> tuple[np.ndarray, ...]:
-    return tuple(np.asarray(part, float) for part in _inferred(twin, jnp.asarray(obs), params))
-
-
-@partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
-def _inferred(twin: Twin, obs: Float[Array, "n rows obs"], params: Params) -> tuple[Array, ...]:
-    """Positions and velocities of joints, and the way from each position to the next."""
-
-    def one(rows: Array) -> tuple[Array, ...]:
-        seen = jax.vmap(lambda row: twin.infer(row, params))(rows)
-        before, after = (jax.tree.map(lambda leaf, s=s: leaf[s], seen) for s in _PAIRS)
-        ways = jax.vmap(twin.difference)(after, before)[:, : len(twin.joints)]
-        return jax.vmap(twin.coordinates)(seen.q), seen.v, ways
-
-    return jax.vmap(one)(obs)

@@ -1,1 +1,1 @@
-"""How a diagnosis is told: sentence, table, page, pictures, film."""
+"""Presentation of a diagnosis: sentence, table, page, figures, film."""

@@ -1,4 +1,4 @@
-"""What a diagnosis says."""
+"""The result of a diagnosis."""
 
 import dataclasses
 import os
@@ -36,8 +36,8 @@ from sb3_hds.sysid.reporting.printed import (
 from sb3_hds.sysid.reporting.wording import with_unit
 
 Verdict = Literal["named", "ambiguous", "none", "unknown", "not_identifiable"]
-# Causes beyond which they are told as those of a machine, and one that the data cannot tell from
-# others leaves the others named; and beyond which they are in a table.
+# With more causes than this, the sentence sums them up by machine, and an ambiguous one does not
+# make the verdict ambiguous; with more than the second number, they are listed in a table.
 MANY, _TABLE = 2, 3
 
 #: what each verdict means
@@ -52,7 +52,7 @@ OTHER_CONVENTION = "The log is not written in the conventions of the model."
 
 
 class _Plain(Protocol):
-    """What can be told as plain data, as what ``measure_policy_gain`` returns."""
+    """A result that converts to plain data, such as that of ``measure_policy_gain``."""
 
     def to_dict(self) -> dict[str, Any]: ...
 
@@ -63,23 +63,22 @@ class Diagnosis:
     Result of :func:`~sb3_hds.sysid.diagnose`. Prints itself.
 
     :param verdict: ``"named"``, ``"ambiguous"``, ``"none"``, ``"unknown"`` or
-        ``"not_identifiable"``; the first two are about the first finding, and a later one may have
-        alternatives all the same
+        ``"not_identifiable"``; the first two refer to the first finding, and later ones may have
+        alternatives in either case
     :param believed: nominal model
     :param twin: extended, ready to train in
     :param data_hash: of the data
-    :param seed: of the split and of what else was drawn
+    :param seed: of the split and all other random choices
     :param findings: causes, in the order in which they were found
-    :param unexplained: what remains after them, in words; empty if nothing does
+    :param unexplained: residual that they do not explain, in words; empty if there is none
     :param convention: which convention of the model the log does not follow (``"zero"``,
         ``"direction"``, ``"command"``, ``"degrees"`` or ``"order"``, and where:
         ``"direction.hinge"``), or empty; ``unexplained`` says what to write
     :param gain: by horizon in steps
-    :param explained: share that the findings explain of the force that is missing and can be
-        predicted, or 0
+    :param explained: share of the predictable residual force that the findings explain, or 0
     :param detectable: by effect and place, the smallest size that these data would have shown, to
-        first order; infinite where the first bit of an effect makes no difference, as of a limit
-        that no command reaches, of a stiff spring in the drive, or of what has no size (a sign)
+        first order; infinite where a small effect makes no difference, such as a limit that no
+        command reaches or a stiff spring in the drive, and for effects without a size (a sign)
     :param rejected: the other candidates, with numbers
     :param caveats: what to keep in mind, in words
     :param versions: of the libraries that computed this
@@ -113,23 +112,23 @@ class Diagnosis:
 
     @property
     def sentence(self) -> str:
-        """The verdict in one sentence; of several causes, with one on what stays open."""
-        doubts = doubts_in_words(self.findings) if self._tells_several else ""
+        """The verdict in one sentence; with several causes, another one on ambiguous ones."""
+        doubts = doubts_in_words(self.findings) if self._sums_up else ""
         return f"{self.headline} {doubts}".rstrip()
 
     @property
-    def _tells_several(self) -> bool:
+    def _sums_up(self) -> bool:
         return self.verdict in ("named", "ambiguous") and len(self.findings) > MANY
 
     @property
     def tabled(self) -> bool:
-        """Whether the causes are so many that they are told in a table."""
+        """Whether there are so many causes that they are listed in a table."""
         return len(self.findings) > _TABLE
 
     @property
     def headline(self) -> str:
         """The verdict in one sentence."""
-        if self._tells_several:
+        if self._sums_up:
             return several_in_words(self.findings, [j.name for j in self.believed.joints])
         if self.verdict == "ambiguous":
             first, *others = self.findings
@@ -140,17 +139,13 @@ class Diagnosis:
             return OTHER_CONVENTION
         if self.verdict != "named":
             return SENTENCES[self.verdict]
-        new = [f for f in self.findings if self._is_new(f)]
+        added = {*self.twin.values} - {*self.believed.values}
+        new = [f for f in self.findings if {e.name for e in f.parameters.values()} <= added]
         said = {"lacks": new, "is wrong about": [f for f in self.findings if f not in new]}
         parts = [
             f"{verb} {' and '.join(map(choice, found))}" for verb, found in said.items() if found
         ]
         return f"The simulation {' and '.join(parts)}."
-
-    def _is_new(self, finding: Finding) -> bool:
-        """Whether the believed twin has nothing of the kind."""
-        names = {e.name for e in finding.parameters.values()}
-        return names <= {*self.twin.values} - {*self.believed.values}
 
     def summary(self) -> str:
         """:return: all of it in 80 columns"""
@@ -184,7 +179,7 @@ class Diagnosis:
 
     @property
     def refitted(self) -> tuple[tuple[str, str, str], ...]:
-        """What was calibrated on the way: name, value as believed, and value in the end."""
+        """Refitted nuisance parameters: name, nominal value and refitted value."""
         known = self.believed.values
         found = {e.name for finding in self.findings for e in finding.parameters.values()}
         for finding in self.findings:
@@ -198,16 +193,16 @@ class Diagnosis:
 
     @property
     def made_with(self) -> str:
-        """What a diagnosis is computed again from."""
+        """Data, seed and versions, to reproduce the diagnosis."""
         versions = "".join(f", {name} {version}" for name, version in self.versions.items())
         return f"Data {self.data_hash}, seed {self.seed}{versions}."
 
     @cached_property
     def answers(self) -> Answers:
         """
-        The answers that the data leave open, each fitted to all of them: the findings, every
-        alternative in the place of its finding, and where something has no name, the candidates
-        that come nearest. Computed when it is first asked for, in seconds.
+        The answers that the data leave open, each fitted to all data: the findings; the same with
+        each alternative in place of its finding; and, if a residual is unexplained, with each of
+        the nearest candidates added. Computed on first access, in seconds.
 
         :raises CalibrationError: where no cause was looked for
         """
@@ -220,12 +215,13 @@ class Diagnosis:
 
     def decided_by(self, data: Trajectories) -> Answers:
         """
-        Weigh the :attr:`answers` by recordings made since, such as those that
-        :meth:`next_experiment` asked for. A diagnosis of all data together asks every candidate
-        again, and counts recordings: one new one among many old ones hardly moves it.
+        Update the weights of the :attr:`answers` by new recordings, such as those that
+        :meth:`next_experiment` proposes. A new diagnosis of all data would test every candidate
+        again and weight recordings equally: one new recording among many old ones hardly changes
+        it.
 
         :param data: recorded since, sampled at the twin's ``dt``
-        :return: the answers with weights and parameters as all data have them, likeliest first;
+        :return: the answers with weights and parameters given all data, likeliest first;
             ``settled`` where one has 95 % of the weight
         :raises CalibrationError: where no cause was looked for, or for other channels or another
             interval than the twin's
@@ -254,25 +250,26 @@ class Diagnosis:
         progress: bool = True,
     ) -> NextExperiment:
         r"""
-        What to record next: smooth commands within the machine's limits that decide between the
-        :attr:`answers`; of a single answer, that tell most about its parameters.
+        Design the next recording: smooth commands within the machine's limits that best
+        discriminate between the :attr:`answers`, or, with a single answer, that give the most
+        information about its parameters.
 
-        The worst pair of answers counts: for each, how far one is from predicting what the other
-        does, its start states and parameters refitted within what the present data allow. Limits
-        hold for every answer, also with parameters two standard deviations off, with a tenth to
-        spare. Commands are those of the twin's actuators: where these are servos, set points of
-        the machine's own loop.
+        The criterion is the worst pair of answers: the distance of one from the predictions of the
+        other, with its start states and parameters refitted within what the present data allow.
+        Limits hold for every answer, also with parameters two standard deviations off, with a
+        margin of a tenth. Commands are those of the twin's actuators: where these are servos, set
+        points of the machine's own loop.
 
         :param limits: what the machine may do, as :class:`~sb3_hds.sysid.design.Limits`, a
             dictionary, or a yml file
         :param n: recordings
         :param seconds: length of each
-        :param start: observation at the start of each, shape ``(n_obs,)``; default: that of the
-            recording which began slowest
+        :param start: observation at the start of each, shape ``(n_obs,)``; default: the slowest
+            start of the recordings
         :param seed: of the search
-        :param progress: whether a bar shows how far it is
-        :return: the commands, what each answer predicts, how surely they would decide, and how
-            often they would have to be recorded; where that is no way to decide, what would be
+        :param progress: whether to show a progress bar
+        :return: the commands, the prediction of each answer, the probability that they decide, and
+            the number of recordings needed; where too many are needed, what would decide instead
         :raises CalibrationError: where no cause was looked for, for an impossible number, length or
             start, or if no commands within the limits were found
         :raises ParameterError: for limits that do not fit the machine
@@ -283,18 +280,14 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """
-        :return: the same, as plain data for JSON: the twins as their specifications, numbers that
-            are not finite as None; ``params`` are the numbers of the extended twin, and arrays that
-            were learned are left out
+        :return: plain data for JSON: the twins as their specifications, numbers that are not finite
+            as None; ``params`` are the values of the extended twin, without learned arrays
         """
-        found = {
-            field.name: getattr(self, field.name)
-            for field in dataclasses.fields(self)
-            if field.name not in ("believed", "twin", "pictures", "opened")
-        }
+        left_out = {"believed", "twin", "pictures", "opened"}
+        names = [f.name for f in dataclasses.fields(self) if f.name not in left_out]
+        found = {name: getattr(self, name) for name in names}
         twins = {"believed": self.believed.to_spec(), "twin": self.twin.to_spec()}
-        said = {"sentence": self.sentence, "params": self.twin.values}
-        return plain(found | twins | said)
+        return plain(found | twins | {"sentence": self.sentence, "params": self.twin.values})
 
     def to_html(
         self,
@@ -303,12 +296,12 @@ class Diagnosis:
         experiment: NextExperiment | None = None,
     ) -> Path:
         """
-        Write one self-contained page: the verdict, its evidence, pictures, caveats.
+        Write one self-contained page: the verdict, its evidence, figures, caveats.
 
-        :param path: of the file, which ends in ``.html``; one of that name is replaced as a whole
+        :param path: of the file, which ends in ``.html``; an existing one is replaced
         :param policy_gain: what ``measure_policy_gain`` returned, where it was measured
-        :param experiment: what :meth:`next_experiment` returned, to be shown with its commands and
-            the motion that each answer predicts
+        :param experiment: what :meth:`next_experiment` returned, to show its commands and the
+            motion that each answer predicts
         :return: its path
         :raises ImportError: without matplotlib and jinja2 (extra ``report``)
         :raises ParameterError: for another ending
@@ -323,24 +316,24 @@ class Diagnosis:
         """
         Write the machine's motion over held-out stretches, measured and as both twins predict it.
 
-        :param path: of the film, which ends in ``.mp4``; a file of that name is replaced as a whole
+        :param path: of the film, which ends in ``.mp4``; an existing one is replaced
         :return: its path
         :raises ImportError: without imageio-ffmpeg and matplotlib
         :raises ParameterError: for another ending, or where nothing was simulated
         :raises OSError: if there is no folder to write it in
         """
+        from sb3_hds.sysid.reporting.animation import animate
         from sb3_hds.sysid.reporting.film import write_film
-        from sb3_hds.sysid.reporting.moving import moving_of
 
         if self.pictures is None:
             raise ParameterError(f"Nothing was simulated, so nothing moves: {self.sentence}")
-        return write_film(moving_of(self.believed, self.twin, self.pictures.replay), path)
+        return write_film(animate(self.believed, self.twin, self.pictures.replay), path)
 
     def save_pictures(self, folder: str | os.PathLike[str]) -> list[Path]:
         """
         Write the pictures of the report as PNG files, for a page or a paper.
 
-        :param folder: is made where it is missing; files of the same names are replaced
+        :param folder: is created if it does not exist; existing files are replaced
         :return: their paths
         :raises ImportError: without matplotlib and jinja2 (extra ``report``)
         """
@@ -349,7 +342,7 @@ class Diagnosis:
         return write_pictures(self, folder)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What was asked for stays; the data that further answers would need do not."""
+        """Pickle without the data from which :attr:`answers` would be computed."""
         return self.__dict__ | {"opened": None}
 
     def __str__(self) -> str:

@@ -1,28 +1,32 @@
-"""Pictures of results; matplotlib is imported only here, and only when one is drawn."""
+"""Figures of results; matplotlib is imported only when one is drawn."""
 
 import io
+import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_hds.core import Trajectories
+from sb3_hds.core.belief import BeliefTwin
 from sb3_hds.sysid.reporting.wording import TRAINED_IN, share_in_words
 
 if TYPE_CHECKING:
     from sb3_hds.sysid.estimation.results import Fit
-    from sb3_hds.sysid.reporting.moving import Moving
     from sb3_hds.sysid.reporting.pictures import Pictures
 
 _MEASURED, _BEFORE, _AFTER, _ALIKE, _QUIET = "#3b3a36", "#d1495b", "#27496d", "#8fabc9", "#9a978c"
-# Widths on a desk or on paper, and on a telephone [in]: letters keep their size.
+# One for each answer that the data leave open.
+_OF_ANSWERS = (_AFTER, _BEFORE, "#8a6d1d", "#2e7d6b", "#7a4f9a", _QUIET)
+# Widths for a desktop or paper, and for a phone [in]; the font size is the same.
 _WIDE, _NARROW = 9.0, 4.4
 _DPI = 150
-# A candidate that makes predictions worse than this is drawn as if it did so by this much.
+# Gains below this are drawn as this.
 _WORST = -0.05
-# How far a panel reaches beyond what was measured, in shares of its range, where the nominal model
-# runs away; and from which ratio on errors are drawn on a logarithmic scale.
+# Margin of a panel around the measurements where the nominal model diverges, in shares of their
+# range; ratio of errors from which they are drawn on a logarithmic scale.
 _AROUND, _DECADE = 0.5, 10.0
-# Letters of a line of a label.
+# Characters per line of a label.
 _LINE = 16
 
 
@@ -35,27 +39,23 @@ def as_png(figure: Any) -> bytes:
 
 def plot_fit(fit: "Fit", path: Any) -> None:
     """Estimates with intervals on the left, errors of each channel on the right."""
-    from matplotlib.figure import Figure
-
     n = max(len(fit.estimates), len(fit.channels))
-    figure = Figure(figsize=(9.0, 1.6 + 0.45 * n), layout="constrained")
+    figure = _empty_figure((_WIDE, 1.6 + 0.45 * n))
     left, right = figure.subplots(1, 2)
     _draw_estimates(left, fit)
     _draw_errors(right, fit)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=_DPI)
 
 
 def plot_rollouts(p: "Pictures", narrow: bool = False) -> Any:
-    """Each channel, and beside it what the simulations miss."""
+    """Each channel as measured and simulated, and beside it the errors of the simulations."""
     figure, panels = _figure(len(p.channels), 2, 1.6, narrow)
     seen = p.replay
     for j, (name, unit) in enumerate(p.channels):
         left, right = panels[j]
         left.plot(seen.time, seen.measured[:, j], ".", color=_MEASURED, ms=3, label="measured")
-        for values, colour, label in (
-            (seen.before, _BEFORE, "before"),
-            (seen.after, _AFTER, "after"),
-        ):
+        simulated = (seen.before, _BEFORE, "before"), (seen.after, _AFTER, "after")
+        for values, colour, label in simulated:
             left.plot(seen.time, values[:, j], color=colour, lw=1.2, label=label)
             missed = values[:, j] - seen.measured[:, j]
             right.plot(seen.time, missed, color=colour, lw=1.2, label=label)
@@ -67,27 +67,19 @@ def plot_rollouts(p: "Pictures", narrow: bool = False) -> Any:
         around = _AROUND * np.ptp(measured[np.isfinite(measured)])
         _cut(left, np.concatenate([measured, after]), around)
         _cut(right, np.append(after - measured, 0.0), around)
-        left.set_ylabel(_label(name, unit), fontsize=8)
+        for axes in panels[j, : 2 if narrow else 1]:
+            axes.set_ylabel(_label(name, unit), fontsize=8)
         if j == 0 or narrow:
             left.set_title("simulated and measured", fontsize=9)
             right.set_title("simulated minus measured", fontsize=9)
-    if narrow:
-        for row, (name, unit) in zip(panels, p.channels, strict=True):
-            row[1].set_ylabel(_label(name, unit), fontsize=8)
-    figure.legend(
-        *panels[0, 0].get_legend_handles_labels(),
-        fontsize=8,
-        frameon=False,
-        ncols=3,
-        loc="outside upper center",
-    )
+    _legend_above(figure, panels[0, 0], 3)
     for axes in panels[-1]:
         axes.set_xlabel("time [s]", fontsize=8)
     return figure
 
 
 def plot_horizons(d: Any, p: "Pictures", narrow: bool = False) -> Any:
-    """Error against the number of steps that are predicted."""
+    """Prediction error against the horizon."""
     figure, panels = _figure(1, 1, 2.6, narrow)
     axes = panels[0, 0]
     for errors, colour, label in zip(p.errors, (_BEFORE, _AFTER), ("before", "after"), strict=True):
@@ -107,7 +99,7 @@ def plot_horizons(d: Any, p: "Pictures", narrow: bool = False) -> Any:
 
 
 def plot_missing_force(p: "Pictures", narrow: bool = False) -> Any:
-    """The force that is missing against position, velocity, command and time, joint by joint."""
+    """The residual force of each joint against position, velocity, command and time."""
     columns = 4 if p.actuators else 3
     figure, panels = _figure(len(p.joints), columns, 2.2, narrow)
     explained = p.missing.force - p.left.force
@@ -151,13 +143,7 @@ def plot_friction(p: "Pictures", narrow: bool = False) -> Any:
         axes.set_ylabel(f"friction [{unit}]", fontsize=8)
     for axes in panels.ravel()[len(p.friction) :]:
         axes.remove()
-    figure.legend(
-        *panels[0, 0].get_legend_handles_labels(),
-        fontsize=8,
-        frameon=False,
-        ncols=2,
-        loc="outside upper center",
-    )
+    _legend_above(figure, panels[0, 0], 2)
     return figure
 
 
@@ -225,8 +211,79 @@ def plot_policy_gain(gain: Mapping[str, Any], narrow: bool = False) -> Any:
     return figure
 
 
+def plot_belief(belief: BeliefTwin, path: str | os.PathLike[str]) -> None:
+    """
+    Draw each uncertain parameter: its draws, by answer, and the value of the likeliest answer.
+
+    :param path: of the picture, for example ``"belief.png"``
+    """
+    rows = max(len(belief.varied), 1)
+    figure = _empty_figure((_WIDE, 0.9 + 0.8 * rows))
+    panels = figure.subplots(rows, 1, squeeze=False)[:, 0]
+    names = list(belief.base.parameters)
+    height = np.random.default_rng(0).uniform(-0.35, 0.35, len(belief.draws))
+    for axes, name in zip(panels, belief.varied, strict=False):
+        values = belief.draws[:, names.index(name)]
+        for m, answer in enumerate(belief.answers):
+            own, colour = belief.origin == m, _OF_ANSWERS[m % len(_OF_ANSWERS)]
+            label = f"{answer} ({belief.weights[m]:.0%})"
+            axes.plot(values[own], height[own], ".", color=colour, ms=4, label=label)
+        axes.axvline(values[0], color=_MEASURED, lw=1.0)
+        axes.set(yticks=[], ylim=(-0.5, 0.5))
+        axes.set_xlabel(_with_unit(name, belief.base.parameters[name].unit), fontsize=8)
+    _legend_above(figure, panels[0], 2)
+    figure.savefig(path, dpi=_DPI)
+
+
+def plot_next(
+    commands: Trajectories,
+    predicted: np.ndarray,
+    answers: Sequence[str],
+    channels: Sequence[tuple[str, str]],
+    actuators: Sequence[tuple[str, str]],
+    narrow: bool = False,
+) -> Any:
+    """
+    The commands of the first recording, and below them each channel as each answer predicts it.
+
+    :param predicted: shape ``(answers, recordings, steps + 1, n_obs)``
+    :param channels: name and unit of each
+    :param actuators: name and unit of each
+    """
+    rows = len(actuators) + len(channels)
+    figure = _empty_figure((_NARROW if narrow else _WIDE, 0.8 + 1.3 * rows))
+    panels = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    time = commands.dt * np.arange(predicted.shape[2])
+    for j, axes in enumerate(panels[: len(actuators)]):
+        axes.step(time[:-1], commands.actions[0, :, j], where="post", color=_MEASURED, lw=1.2)
+    for j, axes in enumerate(panels[len(actuators) :]):
+        for i, answer in enumerate(answers):
+            colour = _OF_ANSWERS[i % len(_OF_ANSWERS)]
+            axes.plot(time, predicted[i, 0, :, j], color=colour, lw=1.2, label=answer)
+    for axes, (name, unit) in zip(panels, [*actuators, *channels], strict=True):
+        axes.set_ylabel(_with_unit(name, unit), fontsize=8)
+    _legend_above(figure, panels[-1], 1 if narrow else 3)
+    panels[-1].set_xlabel("time [s]", fontsize=8)
+    return figure
+
+
+def _legend_above(figure: Any, axes: Any, columns: int) -> None:
+    entries = axes.get_legend_handles_labels()
+    figure.legend(*entries, fontsize=8, frameon=False, ncols=columns, loc="outside upper center")
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return name if unit in ("", "1") else f"{name} [{unit}]"
+
+
+def _empty_figure(size: tuple[float, float]) -> Any:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=size, layout="constrained")
+
+
 def _cut(axes: Any, shown: np.ndarray, around: float) -> None:
-    """End a panel not far beyond what has to be seen in it."""
+    """Limit a panel to the data shown, with a margin."""
     shown = shown[np.isfinite(shown)]
     ends, whole = (shown.min() - around, shown.max() + around), axes.get_ylim()
     if around > 0.0:
@@ -234,7 +291,7 @@ def _cut(axes: Any, shown: np.ndarray, around: float) -> None:
 
 
 def _label(name: str, unit: str) -> str:
-    """Broken between words where it is long."""
+    """Name and unit, with line breaks between words."""
     lines = [""]
     for word in name.replace("_", "_ ").split():
         if lines[-1] and len(lines[-1] + word) > _LINE:
@@ -247,15 +304,12 @@ def _label(name: str, unit: str) -> str:
 def _figure(rows: int, columns: int, height: float, narrow: bool) -> tuple[Any, np.ndarray]:
     """
     :param height: of a row [in]
-    :param narrow: whether the panels of a row stand two in a row, or one
-    :return: figure, and its panels in ``rows`` and ``columns`` wherever they stand
+    :param narrow: whether to place the panels of a row two abreast, or one below the other
+    :return: figure, and its panels in ``rows`` and ``columns``, wherever they are placed
     """
-    from matplotlib.figure import Figure
-
     beside = columns if not narrow else 2 if columns == 4 else 1
     deep = rows * columns // beside
-    size = (_NARROW if narrow else _WIDE, 0.5 + height * deep)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = _empty_figure((_NARROW if narrow else _WIDE, 0.5 + height * deep))
     panels = figure.subplots(deep, beside, squeeze=False).reshape(rows, columns)
     for axes in panels.ravel():
         axes.spines[["top", "right"]].set_visible(False)
@@ -298,68 +352,3 @@ def _draw_errors(axes: Any, fit: "Fit") -> None:
     diverged = "" if known.all() else "\n(before: the simulation diverges)"
     axes.set_title(f"prediction error over a window{diverged}", fontsize=10)
     axes.legend(fontsize=8, frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.06))
-
-
-def draw_film(
-    moving: "Moving",
-    players: Sequence[tuple[str, str]],
-    frames: np.ndarray,
-    path: Any,
-    per_second: int,
-    encoder: str,
-) -> None:
-    """
-    :param players: label and colour of each
-    :param frames: indices of those that are drawn
-    :param path: of the film, of 1,280 x 720 points
-    :param encoder: path of ffmpeg
-    """
-    from matplotlib import rc_context
-    from matplotlib.animation import FFMpegWriter
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Polygon
-
-    n = len(moving.names)
-    figure = Figure(figsize=(12.8, 7.2), dpi=100)
-    grid = figure.add_gridspec(max(n, 1), 2, width_ratios=(3, 2), left=0.02, right=0.98)
-    stage = figure.add_subplot(grid[:, 0])
-    stage.set(xlim=(0, 100), ylim=(100, 0), aspect="equal")
-    stage.axis("off")
-    drawn, shapes = [], []
-    for p, (label, colour) in enumerate(players):
-        patches = [Polygon(corners, closed=True) for corners in moving.outlines[p, 0]]
-        for patch in patches:
-            patch.set(facecolor=(colour, 0.25), edgecolor=colour, lw=0.8)
-            stage.add_patch(patch)
-        shapes.append(patches)
-        width = 3.5 * moving.width * (1.6, 1.0, 0.6)[p]
-        style = {"color": colour, "lw": width, "solid_capstyle": "round", "alpha": 0.9}
-        lines = [stage.plot([], [], **style)[0] for _ in moving.lines[p, 0]]
-        lines[0].set_label(label)
-        drawn.append(lines)
-    legend = stage.legend(loc="lower left", frameon=False)
-    for handle in legend.get_lines():
-        handle.set_linewidth(6.0)
-    cursors = []
-    for j, name in enumerate(moving.names):
-        axes = figure.add_subplot(grid[j, 1])
-        for values, (_, colour) in zip(moving.errors, players[1:], strict=True):
-            axes.plot(moving.time, values[:, j], color=colour, lw=1)
-        axes.set_ylabel(name, rotation=0, ha="right", fontsize=7)
-        axes.tick_params(labelsize=6, labelbottom=j == n - 1)
-        cursors.append(axes.axvline(0.0, color="#2b2a27", lw=0.8))
-    writer = FFMpegWriter(fps=per_second)
-    with (
-        rc_context({"animation.ffmpeg_path": encoder}),
-        writer.saving(figure, str(path), dpi=100),
-    ):
-        for frame in frames.tolist():
-            for lines, places in zip(drawn, moving.lines[:, frame], strict=True):
-                for line, ends in zip(lines, places, strict=True):
-                    line.set_data(ends[:, 0], ends[:, 1])
-            for patches, places in zip(shapes, moving.outlines[:, frame], strict=True):
-                for patch, corners in zip(patches, places, strict=True):
-                    patch.set_xy(corners)
-            for cursor in cursors:
-                cursor.set_xdata([moving.time[frame]] * 2)
-            writer.grab_frame()

@@ -1,4 +1,4 @@
-"""What a diagnosis holds: causes that were found, candidates that were not, errors by horizon."""
+"""Parts of a diagnosis: findings, rejected candidates, and errors by horizon."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -17,12 +17,12 @@ class Finding:
     :param parameters: estimates with intervals and units, by short name
     :param alternatives: keys of candidates that the data cannot distinguish from it, by name and
         place
-    :param p_value: that held-out recordings would gain as much by chance, by the test that
-        confirmed it; where others were asked about before it, it had to pass a stricter level
-    :param family_p_value: that the best of all candidates would gain as much on the recordings that
-        proposed it if nothing were wrong
+    :param p_value: of the test on held-out recordings that confirmed it; where several candidates
+        were tested, its level was stricter
+    :param family_p_value: of the gain of the best of all candidates, on the recordings that
+        proposed it
     :param gain: share by which it lowers the mean square error of held-out recordings
-    :param explanation: one sentence for people
+    :param explanation: one sentence
     :param share: of the force at its joint that it carries, root mean squares; None where that was
         not computed
     """
@@ -52,7 +52,7 @@ class Rejected:
     :param name: effect and place
     :param gain: share by which it lowers the mean square error of held-out recordings, after what
         was accepted
-    :param p_value: that they would gain as much by chance
+    :param p_value: of that gain
     :param why: in words
     """
 
@@ -65,8 +65,8 @@ class Rejected:
 @dataclasses.dataclass(frozen=True)
 class HorizonGain:
     """
-    Error of predictions so many steps ahead, on held-out recordings, over all channels, in units of
-    their noise.
+    Error of predictions a number of steps ahead, on held-out recordings, over all channels, in
+    units of their noise.
 
     :param steps: ahead
     :param before: root mean square error of the nominal model, nuisances refitted

@@ -1,4 +1,4 @@
-"""What a diagnosis shows: numbers ready to draw."""
+"""Data of the figures of a diagnosis, ready to draw."""
 
 from typing import NamedTuple
 
@@ -7,12 +7,12 @@ from jaxtyping import Float, Int
 
 from sb3_hds.sysid.comparison.halves import NOT_FINITE, Half
 from sb3_hds.sysid.comparison.unexplained import MissingForce
-from sb3_hds.sysid.equation.friction import FrictionCurve
+from sb3_hds.sysid.equation.members import FrictionCurve
 from sb3_hds.sysid.estimation.evidence import Point
 
-# Of a normal distribution, 90 % lie within so many standard deviations.
+# Half the width of a 90 % interval of a normal distribution, in standard deviations.
 _NORMAL_90 = 1.645
-# Windows that are shown, at least.
+# Least number of windows that are shown.
 _LEAST_SHOWN = 16
 
 
@@ -24,7 +24,7 @@ class Replay(NamedTuple):
     :param measured: shape ``(rows, n_obs)``
     :param before: by the nominal model, nuisances refitted
     :param after: by the extended twin
-    :param margin: half the width of its 90 % interval, by what it misses in all held-out windows
+    :param margin: half the width of its 90 % interval, by its errors in all held-out windows
     """
 
     time: Float[np.ndarray, " rows"]
@@ -70,7 +70,7 @@ def replay_of(
     :param measured: windows, one after the other
     :param before: simulated minus measured
     :param after: simulated minus measured
-    :param rms: what the extended twin misses in any window, root mean square
+    :param rms: root mean square error of the extended twin over all windows
     """
     n, rows = measured.shape[:2]
     gap = lambda windows: np.concatenate(  # noqa: E731
@@ -84,18 +84,18 @@ def replay_of(
 
 
 def bounded(errors: np.ndarray) -> np.ndarray:
-    """What has run away counts as far off."""
+    """:return: the errors, clipped where a simulation diverged"""
     return np.nan_to_num(np.minimum(errors, NOT_FINITE), nan=NOT_FINITE)
 
 
-def _shown(unit: Int[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
+def _shown(cluster: Int[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
     """
-    :param unit: recording, or piece of one, of each window
-    :return: indices of the windows of the first ones that have enough
+    :param cluster: recording, or piece of one, of each window
+    :return: indices of the windows of the first recordings that have enough of them
     """
-    shown = np.zeros(len(unit), bool)
-    for one in dict.fromkeys(unit.tolist()):
-        shown |= unit == one
+    shown = np.zeros(len(cluster), bool)
+    for one in dict.fromkeys(cluster.tolist()):
+        shown |= cluster == one
         if shown.sum() >= _LEAST_SHOWN:
             break
     return np.flatnonzero(shown)

@@ -1,4 +1,4 @@
-"""A diagnosis in words: causes in one sentence, and all of it in 80 columns."""
+"""A diagnosis in words: causes in one sentence, and all results in 80 columns."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ _NUMBERS = (
     *("no", "one", "two", "three", "four", "five", "six"),
     *("seven", "eight", "nine", "ten", "eleven", "twelve"),
 )
-# Effects that are told of the machine as a whole before anything else, in the order of their words.
+# Effects that are summed up over all joints first, in the order of their mention.
 _FRICTION = (
     *("viscous_friction", "directional_viscous_friction", "concave_friction"),
     *("coulomb_friction", "directional_coulomb_friction"),
@@ -30,13 +30,13 @@ _SHARED = {
 }
 #: of the table of causes
 COLUMNS = ("joint", "cause", "size", "90 % interval", "of force")
-# Words without an article, and from how many doubts on they are counted.
+# Nouns without an article, and the number of ambiguous causes from which they are only counted.
 _UNCOUNTED = ("stiffness", "cogging", "drag", "friction", "elasticity", "backlash", "saturation")
 _MANY_DOUBTS = 3
 
 
 def spoken(key: str) -> str:
-    """A candidate, for people: ``"coulomb_friction.hinge"`` is Coulomb friction at hinge."""
+    """:return: a candidate in words: Coulomb friction at hinge for ``"coulomb_friction.hinge"``"""
     name, _, place = key.partition(".")
     if name == "parameter":
         return place
@@ -53,27 +53,30 @@ def several_in_words(findings: Sequence[Finding], joints: Sequence[str]) -> str:
     """
     :param findings: more than a few
     :param joints: names of all joints of the machine
-    :return: a sentence: friction of the machine as a whole first, and what there is besides
+    :return: a sentence: friction of all joints first, then the other causes
     """
-    friction, rest = [], []
-    for f in findings:
-        (friction if f.effect in _FRICTION and f.where["slot"] == "joint" else rest).append(f)
-    besides = _listed([*_common(rest), *_offsets(rest), *map(_one, _others(rest))])
+    friction = [f for f in findings if f.effect in _FRICTION and f.where["slot"] == "joint"]
+    rest = [f for f in findings if f not in friction]
+    shared = [f for f in rest if f.where["name"] == EVERY]
+    offsets = [f for f in rest if f.effect == "constant_force"]
+    single = [f for f in rest if f not in shared and f not in offsets]
+    besides = _listed([*map(_of_all, shared), *_offsets(offsets), *map(_one, single)])
     head = _friction_of(friction, joints)
     told = f"{head}; {besides} besides." if head and rest else f"{head or besides}."
     return f"{told[:1].upper()}{told[1:]}"
 
 
 def _friction_of(findings: Sequence[Finding], joints: Sequence[str]) -> str:
-    """Of the machine as a whole, and by kind where joints differ."""
+    """Friction of all joints, by kind where joints differ."""
     groups: dict[tuple[str, ...], list[str]] = {}
     for joint in joints:
         own = {f.effect for f in findings if f.where["name"] == joint}
         if own:
             groups.setdefault(tuple(n for n in _FRICTION if n in own), []).append(joint)
-    if not groups:
+    where = [joint for own in groups.values() for joint in own]
+    if not where:
         return ""
-    where = [joint for joint in joints if any(joint in own for own in groups.values())]
+    where.sort(key=list(joints).index)
     subject = f"{_places(where, joints)} {_verb(where)}"
     if len(groups) == 1:
         (kinds,) = groups
@@ -85,27 +88,19 @@ def _friction_of(findings: Sequence[Finding], joints: Sequence[str]) -> str:
     return f"{subject} friction that the model lacks{carried}: {by_kind}"
 
 
-def _common(findings: Sequence[Finding]) -> list[str]:
+def _of_all(finding: Finding) -> str:
     """What all actuators share."""
-    said = []
-    for f in findings:
-        if f.where["name"] == EVERY:
-            how = _SHARED.get(f.effect, f"all actuators have {_article(_plain(f.effect))} of {{}}")
-            said.append(how.format(_size(f)))
-    return said
+    effect = finding.effect
+    how = _SHARED.get(effect, f"all actuators have {_article(_plain(effect))} of {{}}")
+    return how.format(_size(finding))
 
 
 def _offsets(findings: Sequence[Finding]) -> list[str]:
-    own = [f for f in findings if f.effect == "constant_force"]
-    if not own:
+    if not findings:
         return []
-    where, sizes = [f.where["name"] for f in own], [_size(f) for f in own]
-    what = "an offset" if len(own) == 1 else "offsets"
+    where, sizes = [f.where["name"] for f in findings], [_size(f) for f in findings]
+    what = "an offset" if len(findings) == 1 else "offsets"
     return [f"{_listed(where)} {_verb(where)} {what} of {_listed(sizes)}"]
-
-
-def _others(findings: Sequence[Finding]) -> list[Finding]:
-    return [f for f in findings if f.where["name"] != EVERY and f.effect != "constant_force"]
 
 
 def _one(finding: Finding) -> str:
@@ -117,7 +112,7 @@ def _one(finding: Finding) -> str:
 
 
 def _size(finding: Finding) -> str:
-    """The first of its parameters that is not nothing."""
+    """The first of its parameters that is not zero."""
     every = list(finding.parameters.values())
     told = next((e for e in every if e.estimate != 0.0), every[0])
     return with_unit(f"{told.estimate:.2g}", told.unit)
@@ -130,7 +125,7 @@ def _article(name: str) -> str:
 
 
 def doubts_in_words(findings: Sequence[Finding]) -> str:
-    """:return: a sentence on what the data cannot tell from other causes; empty if there is none"""
+    """:return: a sentence on causes that have alternatives; empty if there are none"""
     doubtful = [f for f in findings if f.alternatives]
     if len(doubtful) > _MANY_DOUBTS:
         n = _number(len(doubtful))
@@ -171,15 +166,13 @@ def _carried(own: Sequence[Finding], verb: str) -> str:
 
 
 def _listed(items: Sequence[str]) -> str:
-    return (
-        items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
-    )
+    return " and ".join(filter(None, (", ".join(items[:-1]), *items[-1:])))
 
 
 def rows_of(findings: Sequence[Finding], joints: Sequence[str]) -> list[tuple[str, ...]]:
     """
-    :param joints: names of all joints, in whose order causes are told; others come after them
-    :return: of each size of each cause its :data:`COLUMNS`
+    :param joints: names of all joints, by which causes are ordered; other places come last
+    :return: :data:`COLUMNS` for each parameter of each cause
     """
     order = dict(zip(joints, range(len(joints)), strict=True))
     rows = []
@@ -188,15 +181,15 @@ def rows_of(findings: Sequence[Finding], joints: Sequence[str]) -> list[tuple[st
         own = finding.where["slot"] == "parameter"
         place = "" if own else finding.where["name"]
         share = "" if finding.share is None else f"{finding.share:.0%}"
-        for e in finding.parameters.values():
-            rows.append(
-                (place, name, wording.size_in_words(e), wording.interval_in_words(e), share)
-            )
+        rows += [
+            (place, name, wording.size_in_words(e), wording.interval_in_words(e), share)
+            for e in finding.parameters.values()
+        ]
     return rows
 
 
 def table_of(findings: Sequence[Finding], joints: Sequence[str]) -> list[str]:
-    """Many causes, one line for each size."""
+    """Many causes, one line for each parameter."""
     rows = [COLUMNS, *rows_of(findings, joints)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(COLUMNS))]
     lines = [
@@ -207,7 +200,7 @@ def table_of(findings: Sequence[Finding], joints: Sequence[str]) -> list[str]:
 
 
 def alike_in_words(findings: Sequence[Finding]) -> list[str]:
-    """:return: a sentence on each cause that the data cannot tell from others"""
+    """:return: a sentence on each cause that has alternatives"""
     return [
         f"{spoken(f.key)}: the data cannot tell it from {' or '.join(map(spoken, f.alternatives))}."
         for f in findings
@@ -229,7 +222,7 @@ def finding_in_lines(finding: Finding) -> list[str]:
 
 
 def not_accepted(rejected: Sequence[Rejected]) -> list[str]:
-    """The best as a table, and all others by the reason."""
+    """The best rejected candidates as a table, and all others by reason."""
     if not rejected:
         return []
     best, others = rejected[:_MOST_IN_TABLE], rejected[_MOST_IN_TABLE:]
@@ -263,13 +256,13 @@ def would_have_shown(twin: Twin, detectable: Mapping[str, Mapping[str, float]]) 
 
 
 def choice(finding: Finding) -> str:
-    """With what cannot be told from it."""
+    """:return: a cause in words, with its alternatives"""
     names = [spoken(key) for key in (finding.key, *finding.alternatives)]
     return names[0] if len(names) == 1 else f"either {' or '.join(names)}"
 
 
 def wrapped(text: str, indent: str = "") -> list[str]:
-    # A name that is longer than a line stays whole.
+    # A name that is longer than a line is not broken.
     return textwrap.wrap(
         text,
         WIDTH,

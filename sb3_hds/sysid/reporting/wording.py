@@ -11,14 +11,14 @@ from sb3_hds.effects import ALL
 from sb3_hds.errors import EffectError
 from sb3_hds.sysid.estimation.results import Estimate
 
-#: what each simulation of a measured gain in policy is called
+#: names of the simulations in which policies are trained
 TRAINED_IN = {
     "believed": "the twin as believed",
     "extended": "the extended twin",
     "true": "the true twin",
 }
 
-#: why a candidate is turned down that predicts hardly better than what is believed
+#: why a candidate is rejected that predicts hardly better than the nominal model
 TOO_LITTLE = "gains too little"
 HORIZONS = "Held-out error by steps ahead, in units of what the best fit leaves"
 ALIKE = "The data cannot tell it from:"
@@ -30,20 +30,20 @@ PAIRED = "gain, paired"
 
 
 def share_in_words(gain: float) -> str:
-    """:return: a share of an error that is gained; nothing where there is no number"""
+    """:return: a relative gain as a percentage; empty for NaN"""
     if math.isnan(gain):
         return ""
-    # The sum turns minus nought into nought.
+    # Adding zero turns -0 into 0.
     return "far worse" if gain < -1.0 else f"{round(gain, 2) + 0.0:.0%}"
 
 
 def p_value_in_words(p_value: float) -> str:
-    """:return: a p-value; nothing where there is none"""
+    """:return: a p-value with two digits; empty for NaN"""
     return "" if math.isnan(p_value) else f"{p_value:.2g}"
 
 
 def size_in_words(one: Estimate) -> str:
-    """:return: the estimate with its unit, and what it is added to"""
+    """:return: the estimate with its unit, and the twin's own value that it is added to"""
     size = with_unit(f"{one.estimate:.4g}", one.unit)
     if not one.added_to:
         return size
@@ -51,12 +51,12 @@ def size_in_words(one: Estimate) -> str:
 
 
 def interval_in_words(one: Estimate) -> str:
-    """:return: the ends of its interval"""
+    """:return: the ends of the interval"""
     return f"{one.low:.4g} to {one.high:.4g}"
 
 
 def evidence_in_words(gain: float, p_value: float) -> str:
-    """:return: what speaks for a cause"""
+    """:return: a sentence on the evidence for a cause"""
     return (
         f"It lowers the mean square error of held-out recordings by {share_in_words(gain)} "
         f"(p = {p_value_in_words(p_value)})."
@@ -70,12 +70,12 @@ def explained_in_words(share: float) -> str:
 
 class PolicyWords(NamedTuple):
     """
-    What is told of policies from several simulations.
+    Comparison of policies from several simulations, in words.
 
-    :param measured: what the numbers are
-    :param columns: of the table
-    :param rows: of it
-    :param notes: a sentence each
+    :param measured: what was measured
+    :param columns: titles of the table
+    :param rows: of the table
+    :param notes: one sentence each
     """
 
     measured: str
@@ -90,13 +90,11 @@ def policy_in_words(gain: Mapping[str, Any]) -> PolicyWords:
     found = {TRAINED_IN[name]: one for name, one in simulations.items()} | {PAIRED: gain["gain"]}
     starts = f"{episodes} start {'states' if episodes > 1 else 'state'}"
     over = f"over {runs} runs of {starts} each" if runs > 1 else f"over {starts}, one run"
-    columns, rows = (
-        ("trained in", "return"),
-        [(name, f"{r['mean']:.1f}") for name, r in found.items()],
-    )
+    columns = ("trained in", "return")
+    rows = [(name, f"{one['mean']:.1f}") for name, one in found.items()]
     if runs > 1:
-        columns = (*columns, "90 % interval over runs")
-        ends = (f"{r['low']:.1f} to {r['high']:.1f}" for r in found.values())
+        columns += ("90 % interval over runs",)
+        ends = [f"{one['low']:.1f} to {one['high']:.1f}" for one in found.values()]
         rows = [(*row, interval) for row, interval in zip(rows, ends, strict=True)]
     notes = [_paired_in_words(gain)]
     if runs == 1:
@@ -121,7 +119,7 @@ def _paired_in_words(gain: Mapping[str, Any]) -> str:
 
 
 def with_unit(number: str, unit: str) -> str:
-    """Without a break between them."""
+    """:return: number and unit, joined by a no-break space"""
     return number if unit == "1" else f"{number} {unit}".strip().replace(" ", "\N{NO-BREAK SPACE}")
 
 
@@ -129,7 +127,7 @@ def sizes_in_words(twin: Twin, key: str, sizes: Mapping[str, float]) -> str:
     """
     :param key: of a candidate of this twin
     :param sizes: by short name of the parameter
-    :return: those that are finite
+    :return: the finite ones, with their units
     """
     shown = [
         f"{name} {with_unit(f'{value:.2g}', _unit(twin, key, name))}"
@@ -140,7 +138,7 @@ def sizes_in_words(twin: Twin, key: str, sizes: Mapping[str, float]) -> str:
 
 
 def _unit(twin: Twin, key: str, name: str) -> str:
-    """Unit of a candidate's parameter; empty for an effect that is not of the catalogue."""
+    """Unit of a candidate's parameter; empty for an effect that is not in the catalogue."""
     effect, _, place = key.partition(".")
     full = place if effect == "parameter" else f"{key}.{name}"
     kinds: dict[str, type[Effect]] = {kind.name: kind for kind in ALL}

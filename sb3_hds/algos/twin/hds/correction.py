@@ -23,8 +23,8 @@ from sb3_hds.algos.twin.model import missing_effects, nulls_of
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import Fit
-from sb3_hds.sysid.estimation.calibrate import check_fits, fit_windows, spread_of
-from sb3_hds.sysid.estimation.parameters import each, every_name, free_names
+from sb3_hds.sysid.estimation.calibrate import channel_deviations, check_fits, fit_windows
+from sb3_hds.sysid.estimation.parameters import every_name, free_names, untied
 from sb3_hds.sysid.estimation.prediction import (
     gain,
     is_better,
@@ -151,7 +151,7 @@ def correct(
     """
     check_fits(twin, data)
     recent = data if since is None else last_steps(data, since.n_steps)
-    spread = spread_of(recent)
+    spread = channel_deviations(recent)
     if twin.values == config.nominal:
         single = single_step_errors(twin, recent, spread, _N_SINGLE)
         typical = float(np.quantile(single, _MOST_STEPS))
@@ -273,7 +273,7 @@ def _calibrated(
     try:
         return fit_windows(
             start,
-            each(config.names),
+            untied(config.names),
             windows.learned,
             windows.origin,
             windows.spread,

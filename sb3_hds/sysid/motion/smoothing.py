@@ -1,8 +1,8 @@
 """
 Positions, velocities and accelerations of joints, with the noise of their sensors.
 
-A polynomial is fitted to positions and velocities together in a sliding window, whose width is the
-largest at which what it leaves is still noise.
+A polynomial is fitted to positions and velocities together in a sliding window: the widest one
+whose residuals are still noise.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 # Degree of the polynomial, and half widths of its window in samples.
 _DEGREE, _HALVES = 4, (3, 4, 6, 8, 11, 15, 20, 28, 40)
-# A window is too wide where it leaves more than this multiple of what the narrowest one leaves.
+# A window is too wide if its residuals exceed those of the narrowest one by this factor.
 _TOLERANCE = 1.15
 # Of white noise of one, the standard deviation of fourth differences.
 _FOURTH = np.sqrt(70.0)
@@ -26,7 +26,7 @@ class Smoothed(NamedTuple):
 
     :param q: position [rad] or [m], shape ``(rows,)``
     :param v: velocity at the instants at which it is sampled [rad/s] or [m/s], shape ``(rows,)``
-    :param a: acceleration, likewise
+    :param a: acceleration at the same instants [rad/s2] or [m/s2]
     :param noise_q: standard deviation of a measured position
     :param noise_v: standard deviation of a measured velocity; zero where none is measured
     :param error_v: standard error of ``v``

@@ -1,4 +1,4 @@
-"""A machine that moves: as measured, and as predicted by the nominal and by the extended model."""
+"""Animation of a machine: as measured, and as predicted by the nominal and the extended model."""
 
 import json
 from collections.abc import Callable
@@ -16,29 +16,43 @@ from sb3_hds.core.twin import plant_of
 from sb3_hds.sysid.reporting.pictures import Replay
 from sb3_hds.twins import MechanismTwin
 
-#: who moves: label and colour, the widest first
+
+class Player(NamedTuple):
+    """
+    A motion on the stage.
+
+    :param width: of its capsules, in units of :attr:`Animation.width`
+    """
+
+    label: str
+    colour: str
+    width: float
+    opacity: float
+
+
+#: the motions that are drawn, the widest first
 PLAYERS = (
-    ("measured", "#a9a59a"),
-    ("predicted by the model as it came", "#d1495b"),
-    ("predicted by the corrected model", "#27496d"),
+    Player("measured", "#a9a59a", 1.6, 1.0),
+    Player("predicted by the model as it came", "#d1495b", 1.0, 0.8),
+    Player("predicted by the corrected model", "#27496d", 0.6, 0.9),
 )
-# Frames that a page holds at most, and joints whose errors it shows.
+# Most frames of a page, and most joints whose errors it shows.
 _MOST_FRAMES, _MOST_JOINTS = 400, 12
-# From where a mechanism is seen: turned about its vertical, then tipped towards the eye [rad].
+# Direction of view of a mechanism: azimuth and elevation [rad].
 _AZIMUTH, _ELEVATION = 0.9, 0.35
-# Corners of what a mesh looks like.
+# Corners of the outline of a mesh.
 _CORNERS = 20
-# Size of the drawing in units of its own.
+# Size of the drawing in its units.
 _SIZE = 100.0
 
 
-class Moving(NamedTuple):
+class Animation(NamedTuple):
     """
-    :param time: since the stretch begins [s], shape ``(frames,)``
-    :param lines: of each player, both ends of each capsule as they are seen, in the drawing's
-        units, shape ``(3, frames, capsules, 2, 2)``; not a number where a simulation is not finite
-    :param outlines: corners of what its model's meshes look like, in a circle, likewise, shape
-        ``(3, frames, shapes, corners, 2)``
+    :param time: since the first frame [s], shape ``(frames,)``
+    :param lines: of each player, both ends of each capsule as projected, in the drawing's units,
+        shape ``(3, frames, capsules, 2, 2)``; NaN where a simulation is not finite
+    :param outlines: corners of the projected meshes, counter-clockwise, in the drawing's units,
+        shape ``(3, frames, shapes, corners, 2)``
     :param names: of the joints, with their units
     :param errors: predicted minus measured position of each joint, before and after, shape ``(2,
         frames, joints)``
@@ -54,12 +68,36 @@ class Moving(NamedTuple):
 
     @property
     def still(self) -> int:
-        """The frame that says most: where the two predictions are farthest apart."""
+        """The frame in which the two predictions differ most."""
         gap = np.abs(self.lines[1] - self.lines[2]).reshape(len(self.time), -1)
         return int(np.argmax(np.nan_to_num(gap).max(1)))
 
-    def to_json(self) -> str:
-        """:return: for a page: rounded to what can be seen"""
+    def section(self) -> dict[str, Any]:
+        """:return: what ``animation.html`` shows: a still, and all frames for its script"""
+        still = self.still
+        share = 100.0 * self.time / (self.time[-1] or 1.0)
+        players = [
+            player._asdict()
+            | {
+                "width": self.width * player.width,
+                "lines": np.nan_to_num(lines[still]).reshape(-1, 4),
+                "outlines": [np.nan_to_num(corners).ravel() for corners in outlines[still]],
+            }
+            for player, lines, outlines in zip(PLAYERS, self.lines, self.outlines, strict=True)
+        ]
+        return {
+            "still": still,
+            "time": f"{self.time[still]:.2f}",
+            "cursor": f"{share[still]:.1f}",
+            "players": players,
+            "charts": [
+                _chart(name, self.errors[:, :, j], share) for j, name in enumerate(self.names)
+            ],
+            "json": self._to_json(),
+        }
+
+    def _to_json(self) -> str:
+        """All frames, rounded to visible precision."""
         plain = {
             "time": _numbers(self.time, 3),
             "lines": [[_numbers(frame, 1) for frame in player] for player in self.lines],
@@ -72,10 +110,23 @@ class Moving(NamedTuple):
         return json.dumps(plain, allow_nan=False, separators=(",", ":"))
 
 
-def moving_of(believed: Twin, extended: Twin, replay: Replay) -> Moving:
+def _chart(label: str, errors: np.ndarray, share: np.ndarray) -> dict[str, Any]:
+    """Errors of a joint against time, both predictions on one scale."""
+    finite = np.abs(errors[np.isfinite(errors)])
+    most = float(np.quantile(finite, 0.98)) if len(finite) else 0.0
+    curves = []
+    for values, player in zip(errors, PLAYERS[1:], strict=True):
+        y = 16.0 - 14.0 * np.clip(np.nan_to_num(values) / (most or 1.0), -1.1, 1.1)
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(share, y, strict=True))
+        curves.append((player.colour, points))
+    name, _, unit = label.partition(" [")
+    return {"name": name, "unit": unit.rstrip("]"), "most": most, "curves": curves}
+
+
+def animate(believed: Twin, extended: Twin, replay: Replay) -> Animation:
     """
-    :param believed: nominal model, which reads positions from observations
-    :param extended: the corrected one
+    :param believed: nominal model
+    :param extended: corrected model
     :param replay: held-out stretches
     """
     rows = np.flatnonzero(np.isfinite(replay.time))
@@ -86,12 +137,13 @@ def moving_of(believed: Twin, extended: Twin, replay: Replay) -> Moving:
         for twin, obs in zip((believed, believed, extended), seen, strict=True)
     ]
     ends, joints, meshes = (np.stack(parts) for parts in zip(*found, strict=True))
-    seen_from = ends[..., [0, 2]] if not _is_solid(believed) else _projected(ends)
+    solid = isinstance(plant_of(believed), MechanismTwin)
+    seen_from = _projected(ends) if solid else ends[..., [0, 2]]
     outlines = _outlines(_projected(meshes))
     frame = _frame_of(np.concatenate([part[0].reshape(-1, 2) for part in (seen_from, outlines)]))
     names = tuple(f"{joint.name} [{joint.unit}]" for joint in believed.joints)
     capsules = ends.shape[2]
-    return Moving(
+    return Animation(
         replay.time[rows] - replay.time[rows[0]],
         frame(seen_from),
         frame(outlines),
@@ -124,12 +176,8 @@ def _poses(
     return jax.vmap(one)(obs)
 
 
-def _is_solid(twin: Twin) -> bool:
-    return isinstance(plant_of(twin), MechanismTwin)
-
-
 def _projected(ends: np.ndarray) -> np.ndarray:
-    """Parallel, from in front, to the right and above."""
+    """Parallel projection, seen from the front, the right and above."""
     c, s = np.cos(_AZIMUTH), np.sin(_AZIMUTH)
     right, away = c * ends[..., 0] + s * ends[..., 1], -s * ends[..., 0] + c * ends[..., 1]
     up = np.cos(_ELEVATION) * ends[..., 2] + np.sin(_ELEVATION) * away
@@ -138,8 +186,8 @@ def _projected(ends: np.ndarray) -> np.ndarray:
 
 def _outlines(corners: np.ndarray) -> np.ndarray:
     """
-    :param corners: of convex bodies, as they are seen, shape ``(..., corners, 2)``
-    :return: the farthest of them in each of some directions, in a circle
+    :param corners: of convex bodies as projected, shape ``(..., corners, 2)``
+    :return: the farthest of them in each of ``_CORNERS`` directions
     """
     if not corners.size:
         return np.zeros((*corners.shape[:-2], 0, 2))
@@ -152,7 +200,7 @@ def _outlines(corners: np.ndarray) -> np.ndarray:
 def _frame_of(measured: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """
     :param measured: points, shape ``(n, 2)``
-    :return: what puts points in the drawing's units, y downwards, and these in the middle of it
+    :return: maps points to the drawing's units, y downwards, with these points in its centre
     """
     real = measured[np.isfinite(measured).all(1)]
     low, high = real.min(0), real.max(0)

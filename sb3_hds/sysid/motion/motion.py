@@ -1,6 +1,5 @@
 """Joint positions, velocities and accelerations of recordings, smoothed, at a suitable interval."""
 
-from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -10,26 +9,27 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from sb3_hds.core import Params, Trajectories, Twin, explicit_euler, rollout, semi_implicit_euler
+from sb3_hds.core import Params, Trajectories, Twin, rollout
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
-from sb3_hds.core.twin import plant_of
-from sb3_hds.sysid.equation.plausibility import SET_POINTS
-from sb3_hds.sysid.equation.smoothing import Smoothed, smooth
-from sb3_hds.sysid.estimation.shooting import motion_of
+from sb3_hds.sysid.motion.joints import (
+    differences,
+    joint_motion,
+    kinematics,
+    lag_of,
+    measures_velocity,
+)
+from sb3_hds.sysid.motion.smoothing import Smoothed, smooth
 
-# Samples from which it is told whether a velocity is measured.
-_SOME = 50
-# Rows of all recordings that are kept in any case, and samples that a period of the motion needs
-# beyond these: dry friction turns round faster than a joint swings.
+#: units of commands that are targets of a servo
+SET_POINTS = ("rad", "rad/s", "m", "m/s", "deg", "deg/s")
+# Rows of all recordings below which none are dropped, and samples per period of the motion
+# otherwise: dry friction reverses faster than a joint swings.
 _ENOUGH, _PER_PERIOD = 10_000, 100
-# Of a period, over which positions and velocities are compared; errors by which they must be apart,
-# and the share of the speed or scale that matters.
-_PART, _SURE, _SCALE = 0.25, 4.0, 0.005
-# Share of a joint's excursion in noise above which it does not move.
+# A joint moves if its excursion exceeds its sensor's noise by this factor.
 _STILL = 3.0
 
 
-class Moved(NamedTuple):
+class JointMotion(NamedTuple):
     """
     One recording in joint space, every leaf of shape ``(rows, dof)`` but the actions.
 
@@ -60,11 +60,11 @@ class Motion(NamedTuple):
     :param period: of each joint's motion, ``2 pi rms(v) / rms(a)`` [s]
     :param blurred: intervals over which smoothing blurs a start or a stop, of each joint
     :param seen: share of an interval within which the twin's integrator evaluates forces
-    :param turn: of each joint, a whole turn, or infinity where it slides
+    :param turn: of each joint, one turn [rad], or infinity where it slides
     :param agrees: whether a measured velocity is the derivative of its position
     """
 
-    recordings: tuple[Moved, ...]
+    recordings: tuple[JointMotion, ...]
     origin: np.ndarray
     dt: float
     every: int
@@ -123,7 +123,7 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
     shift = lag_of(twin)
     actions = [np.asarray(data.episode(i)[1], float) for i in range(len(data))]
     raws = [(*pair, u) for pair, u in zip(joint_motion(twin, data), actions, strict=True)]
-    measured = _measured(twin, data)
+    measured = measures_velocity(twin, data)
     expected = _by_the_model(twin, data)
     found = [
         _smoothed(q, v, measured, data.dt, shift, known)
@@ -166,17 +166,14 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
     )
 
 
-class _Expected(NamedTuple):
-    """What the model alone predicts of one recording, each leaf of shape ``(rows, dof)``."""
-
-    q: np.ndarray
-    v: np.ndarray
+#: positions and velocities that the model alone predicts of one recording, each ``(rows, dof)``
+_Expected = tuple[np.ndarray, np.ndarray]
 
 
 def _by_the_model(twin: Twin, data: Trajectories) -> list[_Expected | None]:
     """
-    A servo answers a step of its set point faster than samples follow one another, and no local
-    polynomial has such a corner. Its model has, and what it misses is smooth.
+    A servo follows a step of its set point within a sample, and no local polynomial has such a
+    corner. Its model has, and the residual of the model is smooth.
 
     :return: of each recording; None where commands are no set points, or the model diverges
     """
@@ -194,8 +191,8 @@ def _by_the_model(twin: Twin, data: Trajectories) -> list[_Expected | None]:
         given = jnp.asarray(starts, jnp.float64), jnp.asarray(commands, jnp.float64)
         q, v = map(np.asarray, _simulated(twin, params, *given))
     rows = [int(length) + 1 for length in data.lengths]
-    found = [_Expected(q[i, :m], v[i, :m]) for i, m in enumerate(rows)]
-    return [one if np.isfinite(one.q).all() and np.isfinite(one.v).all() else None for one in found]
+    found = [(q[i, :m], v[i, :m]) for i, m in enumerate(rows)]
+    return [pair if all(np.isfinite(x).all() for x in pair) else None for pair in found]
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICKEST_COMPILATION)
@@ -215,12 +212,12 @@ def _smoothed(
     shift: float,
     expected: _Expected | None,
 ) -> list[Smoothed]:
-    """:return: each joint, as it moved beside what is expected where that leaves less noise"""
+    """:return: each joint, smoothed relative to the model's prediction where that is less noisy"""
     found = []
     for j in range(q.shape[1]):
         own = smooth(q[:, j], v[:, j] if measured[j] else None, dt, shift)
         if expected is not None:
-            beside = expected.q[:, j], expected.v[:, j]
+            beside = expected[0][:, j], expected[1][:, j]
             left = q[:, j] - beside[0], v[:, j] - beside[1] if measured[j] else None
             rest = smooth(*left, dt, shift)
             if rest.noise_q < own.noise_q and rest.noise_v <= own.noise_v:
@@ -236,129 +233,21 @@ def _smoothed(
 def _differences(q: np.ndarray, dt: float, shift: float, expected: _Expected | None) -> np.ndarray:
     if expected is None:
         return differences(q, dt, shift)
-    return expected.v + differences(q - expected.q, dt, shift)
-
-
-def differences(
-    q: Float[np.ndarray, "rows dof"], dt: float, shift: float
-) -> Float[np.ndarray, "rows dof"]:
-    """
-    :param shift: when a velocity is true, between half an interval before its position and half an
-        interval after it
-    :return: from differences to the rows before and after
-    """
-    change = np.diff(q, axis=0) / dt
-    before, after = np.concatenate([change[:1], change]), np.concatenate([change, change[-1:]])
-    return (0.5 - shift) * before + (0.5 + shift) * after
-
-
-def joint_motion(twin: Twin, data: Trajectories) -> list[tuple[np.ndarray, np.ndarray]]:
-    """:return: positions and velocities of each recording as measured, each ``(rows, dof)``"""
-    found = []
-    for i in range(len(data)):
-        obs = np.asarray(data.episode(i)[0], float)[None]
-        q, v = (leaf[0] for leaf in motion_of(twin, obs, data.dt))
-        found.append((_unwrapped(twin, q), v))
-    return found
-
-
-class Kinematics(NamedTuple):
-    """
-    Measured velocities beside the derivatives of their positions, of each joint.
-
-    :param scale: of the velocity, in units of that of the derivative
-    :param zero: of the velocity [rad/s] or [m/s]
-    :param lag: when a velocity is true, in intervals after its position
-    :param agrees: whether scale and zero are right
-    """
-
-    scale: np.ndarray
-    zero: np.ndarray
-    lag: np.ndarray
-    agrees: np.ndarray
-
-
-def kinematics(
-    recordings: Sequence[tuple[np.ndarray, np.ndarray]], dt: float, period: np.ndarray
-) -> Kinematics:
-    """
-    Differences of positions over parts of a period, regressed on integrals of the velocity, on the
-    time and on differences of the velocity; errors are clustered by recording.
-
-    :param recordings: positions and velocities as measured, each of shape ``(rows, dof)``
-    """
-    dof = len(period)
-    theta, agrees = np.zeros((dof, 3)), np.zeros(dof, bool)
-    for j in range(dof):
-        steps = max(2, round(_PART * period[j] / dt)) if np.isfinite(period[j]) else 2
-        tables, rights = [], []
-        for q, v in recordings:
-            places = np.arange(0, len(q), steps)
-            if len(places) < 2:
-                continue
-            trapezoids = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:, j] + v[:-1, j]))]) * dt
-            summed, change = np.diff(trapezoids[places]), np.diff(v[places, j]) * dt
-            tables.append(np.stack([summed, np.full_like(summed, steps * dt), change], 1))
-            rights.append(np.diff(q[places, j]))
-        if not tables:
-            continue
-        table, right = np.concatenate(tables), np.concatenate(rights)
-        size = np.sqrt(np.mean(table**2, 0)) + 1e-300
-        inverse = np.linalg.pinv((table / size).T @ (table / size))
-        theta[j] = inverse @ (table / size).T @ right / size
-        clusters = [x.T @ (y - x @ theta[j]) / size for x, y in zip(tables, rights, strict=True)]
-        spread = inverse @ sum(np.outer(c, c) for c in clusters) @ inverse
-        n = len(clusters)
-        error = np.sqrt(np.diag(spread) * n / max(n - 1, 1)) / size
-        speed = np.sqrt(np.mean(right**2)) / (steps * dt)
-        agrees[j] = abs(theta[j, 0] - 1.0) <= max(_SURE * error[0], _SCALE) and abs(
-            theta[j, 1]
-        ) <= max(_SURE * error[1], _SCALE * speed)
-    return Kinematics(
-        1.0 / np.where(theta[:, 0], theta[:, 0], np.inf), -theta[:, 1], -theta[:, 2], agrees
-    )
-
-
-def lag_of(twin: Twin) -> float:
-    """
-    :return: when a velocity of the twin's is true, in intervals after its position: Euler's rules
-        step the one with the other a sub-step apart
-    """
-    integrator = getattr(plant_of(twin), "integrator", None)
-    if integrator is semi_implicit_euler:
-        return -0.5 / twin.substeps
-    return 0.5 / twin.substeps if integrator is explicit_euler else 0.0
-
-
-def _unwrapped(twin: Twin, q: np.ndarray) -> np.ndarray:
-    """Angles that stay within a turn may be wrapped; others count turns, or degrees."""
-    q = q.copy()
-    for j, joint in enumerate(twin.joints):
-        inside = np.abs(q[:, j] - (np.pi if q[:, j].min() >= 0.0 else 0.0)) <= np.pi + 1e-3
-        if joint.unit == "rad" and inside.all():
-            q[:, j] = np.unwrap(q[:, j])
-    return q
-
-
-def _measured(twin: Twin, data: Trajectories) -> np.ndarray:
-    """Which velocities come from a sensor: where none does, ``infer`` says zero."""
-    obs = jnp.asarray(data.episode(0)[0][:_SOME])
-    speeds = jax.vmap(lambda row: twin.infer(row, twin.params).v)(obs)
-    return np.any(np.asarray(speeds), axis=0)
+    return expected[1] + differences(q - expected[0], dt, shift)
 
 
 def _thinned(
     smoothed: tuple[np.ndarray, ...], raw: np.ndarray, actions: np.ndarray, every: int
-) -> Moved:
+) -> JointMotion:
     q, v, a = smoothed
     if every == 1:
-        return Moved(q, v, a, raw, actions)
+        return JointMotion(q, v, a, raw, actions)
     n = len(actions) // every
     rows = slice(0, n * every + 1, every)
     held = actions[: n * every].reshape(n, every, actions.shape[1]).mean(1)
     # A cubic through its neighbours: noise is averaged, motion is not.
     averaged = np.stack([smooth_mean(x, every) for x in raw.T], 1)
-    return Moved(q[rows], v[rows], a[rows], averaged[rows], held)
+    return JointMotion(q[rows], v[rows], a[rows], averaged[rows], held)
 
 
 def smooth_mean(x: np.ndarray, half: int) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""Motion of joints in recordings: positions, velocities, accelerations, and their noise."""
