@@ -28,7 +28,13 @@ if TYPE_CHECKING:
     from sb3_hds.core.rollout import Rollout, rollout, rollout_policy
     from sb3_hds.core.signals import Actuator, Channel, Joint
     from sb3_hds.core.trajectories import Trajectories
-    from sb3_hds.core.transformed import TransformedTwin, seen_through
+    from sb3_hds.core.transformed import (
+        TRANSFORMS,
+        TransformedTwin,
+        seen_through,
+        transform_from_spec,
+        transform_to_spec,
+    )
     from sb3_hds.core.transforms.barrier import Barrier
     from sb3_hds.core.transforms.base import (
         ActionTransform,
@@ -36,11 +42,9 @@ if TYPE_CHECKING:
         Signals,
         StatefulTransform,
     )
-    from sb3_hds.core.transforms.continuity import Continuity
     from sb3_hds.core.transforms.cpg import Rhythm
-    from sb3_hds.core.transforms.filters import Delay, LowPass, RateLimit, Scale
+    from sb3_hds.core.transforms.filters import Continuity, Delay, LowPass, RateLimit, Scale
     from sb3_hds.core.transforms.history import History
-    from sb3_hds.core.transforms.registry import TRANSFORMS, transform_from_spec, transform_to_spec
     from sb3_hds.core.transforms.rescale import RescaleAction, RescaleObservation
     from sb3_hds.core.twin import State, Twin
     from sb3_hds.core.types import (
@@ -140,7 +144,13 @@ lazily(
         "rollout": ("Rollout", "rollout", "rollout_policy"),
         "signals": ("Actuator", "Channel", "Joint"),
         "trajectories": ("Trajectories",),
-        "transformed": ("TransformedTwin", "seen_through"),
+        "transformed": (
+            "TRANSFORMS",
+            "TransformedTwin",
+            "seen_through",
+            "transform_from_spec",
+            "transform_to_spec",
+        ),
         "transforms.barrier": ("Barrier",),
         "transforms.base": (
             "ActionTransform",
@@ -148,11 +158,9 @@ lazily(
             "Signals",
             "StatefulTransform",
         ),
-        "transforms.continuity": ("Continuity",),
         "transforms.cpg": ("Rhythm",),
-        "transforms.filters": ("Delay", "LowPass", "RateLimit", "Scale"),
+        "transforms.filters": ("Continuity", "Delay", "LowPass", "RateLimit", "Scale"),
         "transforms.history": ("History",),
-        "transforms.registry": ("TRANSFORMS", "transform_from_spec", "transform_to_spec"),
         "transforms.rescale": ("RescaleAction", "RescaleObservation"),
         "twin": ("State", "Twin"),
         "types": (

@@ -1,5 +1,6 @@
 """A twin behind a wrapper, which is again a twin."""
 
+import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -8,18 +9,17 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core.effect import Effect
 from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
+from sb3_hds.core.transforms.barrier import Barrier
 from sb3_hds.core.transforms.base import (
     ActionTransform,
     ObservationTransform,
     Signals,
     StatefulTransform,
 )
-from sb3_hds.core.transforms.registry import (
-    TRANSFORMS,
-    Transform,
-    transform_from_spec,
-    transform_to_spec,
-)
+from sb3_hds.core.transforms.cpg import Rhythm
+from sb3_hds.core.transforms.filters import Continuity, Delay, LowPass, RateLimit, Scale
+from sb3_hds.core.transforms.history import History
+from sb3_hds.core.transforms.rescale import RescaleAction, RescaleObservation
 from sb3_hds.core.twin import Layer, State, Twin
 from sb3_hds.core.types import (
     Action,
@@ -30,6 +30,22 @@ from sb3_hds.core.types import (
     Scalar,
 )
 from sb3_hds.errors import ParameterError
+
+Transform = ObservationTransform | ActionTransform | StatefulTransform
+
+#: The transforms that can be rebuilt from saved data without naming their classes.
+TRANSFORMS: tuple[type[Transform], ...] = (
+    RescaleAction,
+    RescaleObservation,
+    RateLimit,
+    LowPass,
+    Delay,
+    Scale,
+    History,
+    Barrier,
+    Continuity,
+    Rhythm,
+)
 
 
 class TransformedTwin(Layer):
@@ -181,6 +197,30 @@ class TransformedTwin(Layer):
 
     def _base_with_values(self) -> Twin:
         return self.base.with_parameters(**self.values).with_tensors(self.tensors)
+
+
+def transform_to_spec(transform: Transform) -> dict[str, Any]:
+    """:return: plain data from which :func:`transform_from_spec` makes an equal transform"""
+    fields = {f.name: getattr(transform, f.name) for f in dataclasses.fields(transform)}
+    return {"transform": transform.name} | fields
+
+
+def transform_from_spec(
+    spec: Mapping[str, Any], known: Iterable[type[Transform]] = TRANSFORMS
+) -> Transform:
+    """
+    :param spec: what :func:`transform_to_spec` returned
+    :param known: the classes among which the transform is found by name
+    :raises ParameterError: if it is not among them
+    """
+    by_name = {transform.name: transform for transform in known}
+    if spec["transform"] not in by_name:
+        raise ParameterError(
+            f"A twin was saved with the transform '{spec['transform']}', which is not known here. "
+            f"Known are: {', '.join(by_name)}."
+        )
+    fields = {name: value for name, value in spec.items() if name != "transform"}
+    return by_name[spec["transform"]](**fields)
 
 
 def seen_through(

@@ -18,9 +18,7 @@ from sb3_hds.core.transforms.base import (
     StatefulTransform,
     like,
     namespace,
-    refuse_unless,
 )
-from sb3_hds.core.transforms.filters import clipped
 from sb3_hds.errors import ParameterError
 
 
@@ -67,19 +65,19 @@ class Barrier(StatefulTransform):
         super().__post_init__()
         n = len(self.low)
         for field in ("low", "high", "position", "action"):
-            refuse_unless(self, field, len(getattr(self, field)) == n >= 1, f"one per joint ({n})")
+            self.refuse_unless(field, len(getattr(self, field)) == n >= 1, f"one per joint ({n})")
         bounds = np.array([self.low, self.high], float)
-        refuse_unless(self, "low", bool(np.isfinite(bounds).all()), "finite, as high")
-        refuse_unless(self, "share", 0.0 < self.share <= 1.0, "above 0 and at most 1")
-        refuse_unless(self, "gain", 0.0 < self.gain < math.inf, "positive")
-        refuse_unless(self, "dt", 0.0 < self.dt < math.inf, "positive [s]")
-        refuse_unless(self, "tolerance", 0.0 <= self.tolerance < math.inf, "at least 0")
+        self.refuse_unless("low", bool(np.isfinite(bounds).all()), "finite, as high")
+        self.refuse_unless("share", 0.0 < self.share <= 1.0, "above 0 and at most 1")
+        self.refuse_unless("gain", 0.0 < self.gain < math.inf, "positive")
+        self.refuse_unless("dt", 0.0 < self.dt < math.inf, "positive [s]")
+        self.refuse_unless("tolerance", 0.0 <= self.tolerance < math.inf, "at least 0")
         for place, ends in zip(self.position, bounds.T, strict=True):
             turns = isinstance(place, int) or bool(np.all(np.abs(ends) < math.pi))
-            refuse_unless(self, "position", turns, "an index where a limit is half a turn or more")
+            self.refuse_unless("position", turns, "an index where a limit is half a turn or more")
         room = 2.0 * self.tolerance / self.share
         wide = bool(np.all(bounds[1] - bounds[0] > room))
-        refuse_unless(self, "high", wide, f"above low by more than {room:g} (2 tolerance / share)")
+        self.refuse_unless("high", wide, f"above low by more than {room:g} (2 tolerance / share)")
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         low, high = below.limits()
@@ -116,7 +114,7 @@ class Barrier(StatefulTransform):
         free = like(q, [math.inf])
         concatenate, order = namespace(q).concatenate, np.array(joints)
         lower, upper = concatenate([slowest, -free])[order], concatenate([fastest, free])[order]
-        return clipped(clipped(action, below).clip(lower, upper), below), memory
+        return below.clip(below.clip(action).clip(lower, upper)), memory
 
     def positions(self, obs: InnerObs) -> Float[Any, " joints"]:
         """:return: the positions of the guarded joints [rad] or [m]"""

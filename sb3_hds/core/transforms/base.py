@@ -40,6 +40,11 @@ class Signals(NamedTuple):
         """
         return np.clip(0.0, *self.limits())
 
+    def clip(self, command: Float[Any, " act"]) -> Float[Any, " act"]:
+        """:return: the command within the limits of the actuators"""
+        low, high = self.limits()
+        return command.clip(like(command, low), like(command, high))
+
 
 @dataclasses.dataclass(frozen=True)
 class ObservationTransform(abc.ABC):
@@ -173,6 +178,14 @@ class StatefulTransform(abc.ABC):
         obs = seen[: len(below.channels)]
         return obs, seen[len(below.channels) :] if self.observed else self.start(obs, below)
 
+    def refuse_unless(self, field: str, allowed: bool, wanted: str) -> None:
+        """:raises ParameterError: naming the field, what it may be and what it is"""
+        if not allowed:
+            raise ParameterError(
+                f"{type(self).__name__}({field}={getattr(self, field)!r}): {field} must be "
+                f"{wanted}."
+            )
+
 
 def like(array: Any, values: Any) -> Any:
     """:return: the values as an array of the same library, in the same precision"""
@@ -182,30 +195,6 @@ def like(array: Any, values: Any) -> Any:
 def namespace(array: Any) -> Any:
     """:return: ``numpy`` or ``jax.numpy``, wherever the array is from"""
     return array.__array_namespace__()
-
-
-def per_place(transform: StatefulTransform, field: str, n: int, places: str) -> np.ndarray:
-    """
-    :param field: holds one number, or one for each place
-    :return: one number for each of ``n`` places
-    :raises ParameterError: if it has another number of them
-    """
-    values = np.atleast_1d(np.asarray(getattr(transform, field), float))
-    if values.shape not in ((1,), (n,)):
-        raise ParameterError(
-            f"{type(transform).__name__} has {values.size} values of {field}, but there are {n} "
-            f"{places}. Pass one number, or one for each."
-        )
-    return np.broadcast_to(values, (n,))
-
-
-def refuse_unless(transform: StatefulTransform, field: str, allowed: bool, wanted: str) -> None:
-    """:raises ParameterError: naming the field, what it may be and what it is"""
-    if not allowed:
-        raise ParameterError(
-            f"{type(transform).__name__}({field}={getattr(transform, field)!r}): {field} must be "
-            f"{wanted}."
-        )
 
 
 def _hashable(value: Any) -> Any:

@@ -18,15 +18,8 @@ from sb3_hds.core.transforms.base import (
     StatefulTransform,
     like,
     namespace,
-    refuse_unless,
 )
-from sb3_hds.core.transforms.filters import clipped
-from sb3_hds.core.transforms.oscillators import (
-    AmplitudeState,
-    advance_amplitude,
-    advance_phase,
-    period,
-)
+from sb3_hds.core.transforms.oscillators import advance_amplitude, advance_phase, period
 from sb3_hds.errors import ParameterError
 
 _PER_JOINT = ("amplitude", "offset", "phase", "kp", "kd", "action_range")
@@ -94,7 +87,7 @@ class Rhythm(StatefulTransform):
             if not (math.isfinite(value := getattr(self, name)) and value > 0.0):
                 raise ParameterError(f"Rhythm({name}={value}): {name} must be above 0 and finite.")
         for name in ("amplitude_factor", "frequency_factor"):
-            refuse_unless(self, name, len(getattr(self, name)) == 2, "smallest and largest")
+            self.refuse_unless(name, len(getattr(self, name)) == 2, "smallest and largest")
             low, high = getattr(self, name)
             if not (0.0 <= low < high < math.inf and (low > 0.0 or name[0] == "a")):
                 raise ParameterError(f"Rhythm({name}={[low, high]}): needs 0 <= lowest < highest.")
@@ -104,7 +97,7 @@ class Rhythm(StatefulTransform):
                     f"Rhythm({name}={getattr(self, name)}): {name} must be finite."
                 )
         both = len(self.position) == len(self.velocity)
-        refuse_unless(self, "velocity", both, f"as many as positions ({len(self.position)})")
+        self.refuse_unless("velocity", both, f"as many as positions ({len(self.position)})")
 
     def sized(self, n: int) -> "Rhythm":
         """
@@ -183,7 +176,7 @@ class Rhythm(StatefulTransform):
         rhythm, chosen = self.sized(len(below.actuators)), action.clip(-1.0, 1.0)
         target, after = rhythm.target(chosen, memory)
         position, velocity = rhythm.joints_in(obs)
-        return clipped(rhythm.command(chosen, target, position, velocity), below), after
+        return below.clip(rhythm.command(chosen, target, position, velocity)), after
 
     def joints_in(
         self, obs: InnerObs
@@ -208,11 +201,11 @@ class Rhythm(StatefulTransform):
             wanted = _within(action[:n], self.amplitude_factor)
             slowest, fastest = self.frequency_factor
             rate = slowest * (fastest / slowest) ** (0.5 * (action[n] + 1.0))
-            gain, still = self.amplitude_gain, xp.zeros_like(wanted)
-            state = AmplitudeState(memory[2 : 2 + n], gain * memory[2 + n :], still)
-            radius = advance_amplitude(state, wanted, 0.0, 0.5 * dt, gain).radius
-            settled = advance_amplitude(state, wanted, 0.0, dt, gain)
-            after = xp.concatenate([settled.radius, settled.speed / gain])
+            gain = self.amplitude_gain
+            now = memory[2 : 2 + n], gain * memory[2 + n :]
+            radius, _ = advance_amplitude(*now, wanted, 0.5 * dt, gain)
+            radius_after, speed_after = advance_amplitude(*now, wanted, dt, gain)
+            after = xp.concatenate([radius_after, speed_after / gain])
         gone = (clock * cycle + 0.5 * rate * dt) % cycle
         phase = advance_phase(like(memory, self.phase), gone, self.omega_swing, self.omega_stance)
         aim = radius * like(memory, self.amplitude) * xp.sin(phase) + like(memory, self.offset)

@@ -1,4 +1,4 @@
-"""Transforms of commands: rate limit, low-pass filter, delay, scale."""
+"""Transforms of commands: rate limit, low-pass filter, delay, scale, penalty on changes."""
 
 import dataclasses
 import math
@@ -19,9 +19,8 @@ from sb3_hds.core.transforms.base import (
     StatefulTransform,
     like,
     namespace,
-    per_place,
-    refuse_unless,
 )
+from sb3_hds.errors import ParameterError
 
 #: of a low-pass [cycles per step]: 0.1 Hz at 10 kHz
 LOWEST_CUTOFF = 1e-5
@@ -31,8 +30,18 @@ _ROUNDING = 1e-5
 _NEGLIGIBLE = 1e-12
 
 
+class LastCommand(StatefulTransform):
+    """Abstract: remembers the last command; before an episode, the one nearest to zero."""
+
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        return tuple(Channel(f"last {a.name}", *a[1:]) for a in below.actuators)
+
+    def start(self, obs: InnerObs, below: Signals) -> Recalled:
+        return like(obs, below.rest())
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RateLimit(StatefulTransform):
+class RateLimit(LastCommand):
     r"""
     Commands change by at most :math:`\Delta` from one step to the next:
 
@@ -51,22 +60,28 @@ class RateLimit(StatefulTransform):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        refuse_unless(self, "max_change", bool(np.all(np.array(self.max_change) > 0.0)), "positive")
+        self.refuse_unless("max_change", bool(np.all(np.array(self.max_change) > 0.0)), "positive")
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
-        per_place(self, "max_change", len(below.actuators), "actuators")
-        return tuple(Channel(f"last {a.name}", *a[1:]) for a in below.actuators)
-
-    def start(self, obs: InnerObs, below: Signals) -> Recalled:
-        return namespace(obs).asarray(below.rest(), dtype=obs.dtype)
+        self._per_actuator(below)
+        return super().remembers(below)
 
     def act(
         self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
     ) -> tuple[InnerAction, Recalled]:
-        most = like(action, per_place(self, "max_change", len(below.actuators), "actuators"))
-        wanted = clipped(action, below)
+        most = like(action, self._per_actuator(below))
+        wanted = below.clip(action)
         command = wanted.clip(memory - most, memory + most)
         return command, command
+
+    def _per_actuator(self, below: Signals) -> np.ndarray:
+        values, n = np.atleast_1d(np.asarray(self.max_change, float)), len(below.actuators)
+        if values.shape not in ((1,), (n,)):
+            raise ParameterError(
+                f"RateLimit has {values.size} values of max_change, but there are {n} actuators. "
+                "Pass one number, or one for each."
+            )
+        return np.broadcast_to(values, (n,))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -99,9 +114,9 @@ class LowPass(StatefulTransform):
     def __post_init__(self) -> None:
         super().__post_init__()
         fine = LOWEST_CUTOFF <= self.cutoff < 0.5
-        refuse_unless(self, "cutoff", fine, f"from {LOWEST_CUTOFF:g} to below 0.5")
+        self.refuse_unless("cutoff", fine, f"from {LOWEST_CUTOFF:g} to below 0.5")
         whole = isinstance(self.order, int) and self.order >= 1
-        refuse_unless(self, "order", whole, "a whole number of at least 1")
+        self.refuse_unless("order", whole, "a whole number of at least 1")
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         low, high = below.limits()
@@ -119,9 +134,9 @@ class LowPass(StatefulTransform):
     def act(
         self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
     ) -> tuple[InnerAction, Recalled]:
-        n, wanted = len(below.actuators), clipped(action, below)
+        n, wanted = len(below.actuators), below.clip(action)
         y, after = self._passed(wanted, [memory[i * n : (i + 1) * n] for i in range(self.order)])
-        return clipped(y, below), namespace(action).concatenate(after)
+        return below.clip(y), namespace(action).concatenate(after)
 
     def _passed(self, y: Any, z: Sequence[Any]) -> tuple[Any, list[Any]]:
         """
@@ -175,7 +190,7 @@ class Delay(StatefulTransform):
     def __post_init__(self) -> None:
         super().__post_init__()
         whole = isinstance(self.steps, int) and self.steps >= 1
-        refuse_unless(self, "steps", whole, "a whole number of at least 1")
+        self.refuse_unless("steps", whole, "a whole number of at least 1")
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         return tuple(
@@ -188,7 +203,7 @@ class Delay(StatefulTransform):
     def act(
         self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
     ) -> tuple[InnerAction, Recalled]:
-        n, queue = len(below.actuators), [memory, clipped(action, below)]
+        n, queue = len(below.actuators), [memory, below.clip(action)]
         return memory[:n], namespace(action).concatenate(queue)[n:]
 
 
@@ -222,7 +237,7 @@ class Scale(StatefulTransform):
         fine = fine and bool(np.all(np.diff(points[:, 0]) > 0.0))
         fine = fine and bool(np.all((points[:, 1] > 0.0) & (points[:, 1] <= 1.0)))
         wanted = "pairs of steps, growing from 0, and a share above 0 and at most 1"
-        refuse_unless(self, "schedule", bool(fine), wanted)
+        self.refuse_unless("schedule", bool(fine), wanted)
 
     @property
     def length(self) -> float:
@@ -232,7 +247,7 @@ class Scale(StatefulTransform):
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         n = len(below.actuators)
         fine = self.axes is None or (len(self.axes) > 0 and set(self.axes) <= set(range(n)))
-        refuse_unless(self, "axes", fine, f"numbers of the {n} actuators, from 0 to {n - 1}")
+        self.refuse_unless("axes", fine, f"numbers of the {n} actuators, from 0 to {n - 1}")
         return (Channel("progress of the scale", "1", 0.0, 1.0),) if self.length else ()
 
     def start(self, obs: InnerObs, below: Signals) -> Recalled:
@@ -248,7 +263,7 @@ class Scale(StatefulTransform):
     ) -> tuple[InnerAction, Recalled]:
         middle = like(action, 0.5 * np.sum(below.limits(), 0))
         share = self.share(memory, len(below.actuators))
-        command = middle + share * (clipped(action, below) - middle)
+        command = middle + share * (below.clip(action) - middle)
         return command, (memory + 1.0 / self.length).clip(0.0, 1.0) if self.length else memory
 
     def share(self, memory: Recalled, n: int) -> Any:
@@ -263,7 +278,32 @@ class Scale(StatefulTransform):
         return 1.0 + like(memory, np.isin(np.arange(n), self.axes)) * (share - 1.0)
 
 
-def clipped(command: Float[Any, " act"], below: Signals) -> Float[Any, " act"]:
-    """:return: the command within the limits of the actuators below"""
-    low, high = below.limits()
-    return command.clip(like(command, low), like(command, high))
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Continuity(LastCommand):
+    r"""
+    Subtracts :math:`w\,|a_k - a_{k-1}|^2` from the reward, and does not change actions.
+
+    Remembers :math:`a_{k-1}`; before an episode, the command nearest to zero.
+
+    Source: Raffin, Kober and Stulp, *Smooth exploration for robotic reinforcement learning*, CoRL
+    2021, section 4.1, where it is a measure.
+
+    :param weight: :math:`w`
+    :raises ParameterError: unless it is finite and at least 0
+    """
+
+    name: ClassVar[str] = "continuity"
+
+    weight: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.refuse_unless("weight", 0.0 <= self.weight < math.inf, "finite and at least 0")
+
+    def act(
+        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
+    ) -> tuple[InnerAction, Recalled]:
+        return action, below.clip(action)
+
+    def cost(self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals) -> Any:
+        return self.weight * ((below.clip(action) - memory) ** 2).sum()

@@ -14,9 +14,7 @@ from sb3_hds.core.transforms.base import (
     Signals,
     StatefulTransform,
     namespace,
-    refuse_unless,
 )
-from sb3_hds.core.transforms.filters import clipped
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,9 +37,9 @@ class History(StatefulTransform):
         for field in ("n_observations", "n_actions"):
             value = getattr(self, field)
             whole = isinstance(value, int) and value >= 0
-            refuse_unless(self, field, whole, "a whole number of at least 0")
-        refuse_unless(self, "n_actions", self.n_observations + self.n_actions > 0, "positive")
-        refuse_unless(self, "observed", self.observed, "True: seeing it is all that it is for")
+            self.refuse_unless(field, whole, "a whole number of at least 0")
+        self.refuse_unless("n_actions", self.n_observations + self.n_actions > 0, "positive")
+        self.refuse_unless("observed", self.observed, "True: seeing it is all that it is for")
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         return _earlier(below.channels, self.n_observations) + _earlier(
@@ -57,7 +55,7 @@ class History(StatefulTransform):
         n_seen, n_done = self.n_observations * obs.shape[0], self.n_actions * action.shape[0]
         concatenate = namespace(action).concatenate
         seen = concatenate([obs, memory[:n_seen]])[:n_seen]
-        done = concatenate([clipped(action, below), memory[n_seen:]])[:n_done]
+        done = concatenate([below.clip(action), memory[n_seen:]])[:n_done]
         return action, concatenate([seen, done])
 
 

@@ -75,14 +75,10 @@ def advance_phase(
     return xp.where(gone < swing, in_swing, in_stance)
 
 
-def phase_at(gait: Gait, time: Scalar | float) -> PerJoint:
-    """:return: the phase of each joint ``time`` seconds after the start [rad], exactly"""
-    return advance_phase(gait.phase, time, gait.omega_swing, gait.omega_stance)
-
-
 def target_at(gait: Gait, time: Scalar | float) -> PerJoint:
     """:return: the wanted position of each joint ``time`` seconds after the start"""
-    return gait.amplitude * jnp.sin(phase_at(gait, time)) + gait.offset
+    phase = advance_phase(gait.phase, time, gait.omega_swing, gait.omega_stance)
+    return gait.amplitude * jnp.sin(phase) + gait.offset
 
 
 _HALF, _QUARTER = math.pi, 0.5 * math.pi
@@ -96,49 +92,34 @@ LEADS: dict[str, tuple[float, float, float, float]] = {
 }
 
 
-class AmplitudeState(NamedTuple):
-    """
-    Arrays of NumPy or JAX.
+def advance_amplitude(
+    radius: Float[Any, " n"],
+    speed: Float[Any, " n"],
+    mu: Float[Any, " n"],
+    dt: Scalar | float,
+    gain: Scalar | float,
+) -> tuple[Float[Any, " n"], Float[Any, " n"]]:
+    r"""
+    Amplitudes that follow their commands:
+
+    .. math:: \ddot r = a \left(\tfrac{a}{4} (\mu - r) - \dot r\right)
+
+    The equation is linear and critically damped, so it is solved exactly while the command is
+    held, with :math:`e = r - \mu` and :math:`k = a/2`:
+    :math:`e(t) = (e_0 + (\dot r_0 + k e_0)\,t)\,e^{-kt}`. Takes arrays of NumPy and JAX alike.
+
+    Source: Bellegarda and Ijspeert, *CPG-RL: Learning central pattern generators for quadruped
+    locomotion*, RA-L 2022, equation 1.
 
     :param radius: amplitude of each oscillator
     :param speed: its time derivative [1/s]
-    :param phase: of each [rad], within one turn
-    """
-
-    radius: Float[Any, " n"]
-    speed: Float[Any, " n"]
-    phase: Float[Any, " n"]
-
-
-def advance_amplitude(
-    state: AmplitudeState,
-    mu: Float[Any, " n"],
-    omega: Float[Any, " #n"] | Scalar | float,
-    dt: Scalar | float,
-    gain: Scalar | float = 150.0,
-) -> AmplitudeState:
-    r"""
-    Oscillators whose amplitude and frequency are commanded, not coupled to each other:
-
-    .. math:: \ddot r = a \left(\tfrac{a}{4} (\mu - r) - \dot r\right), \qquad \dot\theta = \omega
-
-    The first is critically damped and linear, so while the commands are held both are solved
-    exactly, with :math:`e = r - \mu` and :math:`k = a/2`:
-    :math:`e(t) = (e_0 + (\dot r_0 + k e_0)\,t)\,e^{-kt}`.
-
-    Source: Bellegarda and Ijspeert, *CPG-RL: Learning central pattern generators for quadruped
-    locomotion*, RA-L 2022, equations 1 and 2.
-
-    :param mu: amplitudes to settle at
-    :param omega: [rad/s]
+    :param mu: commanded amplitudes
     :param dt: how long the commands are held [s]
     :param gain: :math:`a` [1/s]
-    :return: the state ``dt`` later
+    :return: amplitudes and their time derivatives ``dt`` later
     """
-    k, xp = 0.5 * gain, state.radius.__array_namespace__()
-    error = state.radius - mu
-    slope = state.speed + k * error
-    decay = xp.exp(-k * dt)
-    radius = mu + (error + slope * dt) * decay
-    speed = (slope - k * (error + slope * dt)) * decay
-    return AmplitudeState(radius, speed, (state.phase + omega * dt) % (2.0 * math.pi))
+    k, error = 0.5 * gain, radius - mu
+    decay = radius.__array_namespace__().exp(-k * dt)
+    slope = speed + k * error
+    error = error + slope * dt
+    return mu + error * decay, (slope - k * error) * decay
