@@ -1,6 +1,6 @@
 """Atomic writes of files; arrays are stored without pickle."""
 
-import contextlib
+import io
 import os
 import secrets
 import struct
@@ -28,18 +28,23 @@ def check_target(path: str | os.PathLike[str]) -> None:
         raise IsADirectoryError(f"{target} is a folder. Name a file.")
 
 
-def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
+def write_bytes(path: str | os.PathLike[str], content: bytes, *, durable: bool = False) -> Path:
     """
     Write under a temporary name in the same folder, then rename: a reader never sees half a file.
 
     :param path: a file of that name is replaced
+    :param durable: flush it to the disk before renaming, so that it survives a loss of power
     :return: the path of the file
     :raises OSError: if the file cannot be written; an older file there is left as it was
     """
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
     try:
-        temporary.write_bytes(content)
+        with temporary.open("xb") as file:
+            file.write(content)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
@@ -48,7 +53,7 @@ def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
 
 def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:
     """
-    Write under a temporary name in the same folder, then rename: a reader never sees half a file.
+    Write arrays as :func:`write_bytes` does.
 
     :param path: ``.npz`` is appended where it is missing, as numpy does
     :param arrays: by name; none may hold objects
@@ -58,23 +63,15 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:
     target = Path(path)
     if target.suffix != _SUFFIX:
         target = target.with_name(target.name + _SUFFIX)
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
+    compressed = io.BytesIO()
+    np.savez_compressed(compressed, **arrays)
     try:
-        try:
-            with temporary.open("xb") as file:
-                np.savez_compressed(file, **arrays)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, target)
-        finally:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
+        return write_bytes(target, compressed.getvalue(), durable=True)
     except OSError as error:
         raise TrajectoryError(
             f"'{target}' could not be written: {error.strerror}. "
             "The folder must exist and be writable, with space left on the disk."
         ) from error
-    return target
 
 
 def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
