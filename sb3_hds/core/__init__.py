@@ -10,6 +10,7 @@ from sb3_hds.lazy import lazily
 
 if TYPE_CHECKING:
     from sb3_hds.core.analytic import AnalyticTwin
+    from sb3_hds.core.declarations import Actuator, Channel, Joint, Parameter
     from sb3_hds.core.effect import (
         ActionEffect,
         Effect,
@@ -24,9 +25,7 @@ if TYPE_CHECKING:
     from sb3_hds.core.extended import ExtendedTwin
     from sb3_hds.core.numerics.integrators import explicit_euler, rk4, semi_implicit_euler
     from sb3_hds.core.numerics.linear import solve_spd
-    from sb3_hds.core.parameter import Parameter
     from sb3_hds.core.rollout import Rollout, rollout, rollout_policy
-    from sb3_hds.core.signals import Actuator, Channel, Joint
     from sb3_hds.core.trajectories import Trajectories
     from sb3_hds.core.transformed import (
         TRANSFORMS,
@@ -140,9 +139,8 @@ lazily(
         "extended": ("ExtendedTwin",),
         "numerics.integrators": ("explicit_euler", "rk4", "semi_implicit_euler"),
         "numerics.linear": ("solve_spd",),
-        "parameter": ("Parameter",),
         "rollout": ("Rollout", "rollout", "rollout_policy"),
-        "signals": ("Actuator", "Channel", "Joint"),
+        "declarations": ("Actuator", "Channel", "Joint", "Parameter"),
         "trajectories": ("Trajectories",),
         "transformed": (
             "TRANSFORMS",

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from sb3_hds.core.analytic import AnalyticTwin
-from sb3_hds.core.signals import Actuator, Channel, Joint
+from sb3_hds.core.declarations import Actuator, Channel, Joint
 from sb3_hds.core.twin import State, Twin, layers_of
 from sb3_hds.errors import TwinError
 

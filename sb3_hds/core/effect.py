@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
+from sb3_hds.core.declarations import Parameter
 from sb3_hds.core.numerics.linear import solve_spd
-from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.types import (
     Action,
     Coordinates,

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sb3_hds.core.declarations import Parameter
 from sb3_hds.core.effect import ActionEffect, Effect, ForceEffect, SensorEffect
 from sb3_hds.core.effect_chain import NO_EFFECTS, Attached, Chosen, EffectChain
-from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.transformed import TransformedTwin
 from sb3_hds.core.twin import Layer, State, Twin
 from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar

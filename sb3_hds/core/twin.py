@@ -12,10 +12,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sb3_hds.core.declarations import Actuator, Channel, Joint, Parameter
 from sb3_hds.core.effect import Effect
 from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
-from sb3_hds.core.parameter import Parameter
-from sb3_hds.core.signals import Actuator, Channel, Joint
 from sb3_hds.core.types import (
     Action,
     Coordinates,

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core.signals import Actuator, Channel
+from sb3_hds.core.declarations import Actuator, Channel
 from sb3_hds.errors import ParameterError
 
 # Arrays of NumPy or JAX; "outer" is the policy's side of a wrapper, "inner" the side of the plant.

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core.signals import Channel
+from sb3_hds.core.declarations import Channel
 from sb3_hds.core.transforms.base import (
     InnerAction,
     InnerObs,

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from sb3_hds.core.signals import Actuator, Channel
+from sb3_hds.core.declarations import Actuator, Channel
 from sb3_hds.core.transforms.base import (
     InnerAction,
     InnerObs,

@@ -1,8 +1,8 @@
-"""A physical constant that can be estimated from data."""
+"""What a twin declares: joints, actuators, observation channels and physical parameters."""
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from sb3_hds.errors import ParameterError
 
@@ -15,6 +15,54 @@ _PRISMATIC_UNIT = {
     "rad": "m",
     "rad/s": "m/s",
 }
+
+
+class Joint(NamedTuple):
+    """
+    One degree of freedom.
+
+    :param name: unique within the twin
+    :param unit: unit of its position: ``"rad"`` for a hinge, ``"m"`` for a slider
+    :param low: position of the lower end stop, which the twin does not simulate
+    :param high: position of the upper end stop
+    """
+
+    name: str
+    unit: str = "rad"
+    low: float = float("-inf")
+    high: float = float("inf")
+
+
+class Actuator(NamedTuple):
+    """
+    One command.
+
+    :param name: unique within the twin
+    :param unit: unit of the command
+    :param low: smallest command that the environment accepts
+    :param high: largest command that the environment accepts
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+class Channel(NamedTuple):
+    """
+    One entry of the observation.
+
+    :param name: unique within the twin
+    :param unit: unit of the measurement
+    :param low: smallest value that the observation space declares
+    :param high: largest value that the observation space declares
+    """
+
+    name: str
+    unit: str
+    low: float = float("-inf")
+    high: float = float("inf")
 
 
 @dataclasses.dataclass(frozen=True)
