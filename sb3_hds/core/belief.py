@@ -15,7 +15,7 @@ from sb3_hds.core.effect import Effect
 from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
 from sb3_hds.core.trajectories.storage import check_target, write_bytes
 from sb3_hds.core.twin import Layer, State, Twin
-from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar
+from sb3_hds.core.types import Action, Obs, Params
 from sb3_hds.errors import ParameterError
 
 #: under which the state remembers its draw, and the tensor that holds all of them
@@ -145,30 +145,14 @@ class BeliefTwin(Layer):
         return self._under(draw, self.base.infer(obs, self._params(draw, params)))
 
     def observe(self, state: State, params: Params) -> Obs:
-        return self.base.observe(*self._of(state, params))
+        return self.base.observe(self.inner_state(state), self.inner_params(state, params))
 
     def step(
         self, state: State, action: Action, params: Params, effects: EffectChain = NO_EFFECTS
     ) -> State:
-        inner, own = self._of(state, params)
-        after = self.base.step(inner, action, own, effects)
+        own = self.inner_params(state, params)
+        after = self.base.step(self.inner_state(state), action, own, effects)
         return after._replace(memory=after.memory | {_DRAW: state.memory[_DRAW]})
-
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        inner, own = self._of(state, params)
-        return self.base.reward(inner, action, self._of(next_state, params)[0], own)
-
-    def planning_reward(
-        self, state: State, action: Action, next_state: State, params: Params
-    ) -> Scalar:
-        inner, own = self._of(state, params)
-        return self.base.planning_reward(inner, action, self._of(next_state, params)[0], own)
-
-    def terminated(self, state: State, params: Params) -> Flag:
-        return self.base.terminated(*self._of(state, params))
-
-    def sketch(self, state: State, params: Params) -> Any:
-        return self.base.sketch(*self._of(state, params))
 
     def to_spec(self) -> dict[str, Any]:
         told = {
@@ -194,11 +178,13 @@ class BeliefTwin(Layer):
         drawn = {name: own[i] for i, name in enumerate(self.varied)}
         return {name: params[name] for name in (*self.values, *self.base.tensors)} | drawn
 
-    def _of(self, state: State, params: Params) -> tuple[State, Params]:
-        """The state as the twin below has it, and the parameters of its draw."""
-        memory = dict(state.memory)
-        draw = jax.lax.stop_gradient(memory.pop(_DRAW))
-        return state._replace(memory=memory), self._params(jnp.round(draw).astype(int), params)
+    def inner_state(self, state: State) -> State:
+        memory = {key: own for key, own in state.memory.items() if key != _DRAW}
+        return state._replace(memory=memory)
+
+    def inner_params(self, state: State, params: Params) -> Params:
+        draw = jax.lax.stop_gradient(state.memory[_DRAW])
+        return self._params(jnp.round(draw).astype(int), params)
 
     def _under(self, draw: Any, state: State) -> State:
         return state._replace(memory=state.memory | {_DRAW: draw.astype(state.q.dtype)})

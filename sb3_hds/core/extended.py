@@ -9,14 +9,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from sb3_hds.core.declarations import Parameter
 from sb3_hds.core.effect import ActionEffect, Effect, ForceEffect, SensorEffect
 from sb3_hds.core.effect_chain import NO_EFFECTS, Attached, Chosen, EffectChain
 from sb3_hds.core.transformed import TransformedTwin
 from sb3_hds.core.twin import Layer, State, Twin
-from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar
+from sb3_hds.core.types import Action, Obs, Params, Scalar
 from sb3_hds.errors import EffectError
 
 
@@ -118,9 +118,6 @@ class ExtendedTwin(Layer):
             obs = obs.at[a.index].set(reported)
         return state._replace(memory=memory)
 
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        return self.base.reward(state, action, next_state, self.base_params(params))
-
     def planning_reward(
         self, state: State, action: Action, next_state: State, params: Params
     ) -> Scalar:
@@ -130,11 +127,8 @@ class ExtendedTwin(Layer):
             reward = reward - a.effect.doubt(self.base, state, action, base, a.own(params))
         return reward
 
-    def terminated(self, state: State, params: Params) -> Flag:
-        return self.base.terminated(state, self.base_params(params))
-
-    def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
-        return self.base.sketch(state, self.base_params(params))
+    def inner_params(self, state: State, params: Params) -> Params:
+        return self.base_params(params)
 
     def choose(self, keys: Collection[str]) -> Chosen:
         """
@@ -158,11 +152,6 @@ class ExtendedTwin(Layer):
     def __repr__(self) -> str:
         parts = (self._base_with_values(), *self.effects_with_values())
         return f"{type(self).__name__}({', '.join(map(repr, parts))})"
-
-    def _base_with_values(self) -> Twin:
-        return self.base.with_parameters(
-            **{name: self.values[name] for name in self.base.parameters}
-        )
 
     def base_params(self, params: Params) -> Params:
         """:return: parameters of the twin below, with what native effects change of them"""

@@ -23,7 +23,6 @@ from sb3_hds.core.transforms.rescale import RescaleAction, RescaleObservation
 from sb3_hds.core.twin import Layer, State, Twin
 from sb3_hds.core.types import (
     Action,
-    Flag,
     Memory,
     Obs,
     Params,
@@ -145,12 +144,6 @@ class TransformedTwin(Layer):
         reward = self.base.planning_reward(state, command, next_state, params)
         return reward - self._cost(state, action, params)
 
-    def terminated(self, state: State, params: Params) -> Flag:
-        return self.base.terminated(state, params)
-
-    def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
-        return self.base.sketch(state, params)
-
     def to_spec(self) -> dict[str, Any]:
         spec = self._base_with_values().to_spec()
         layer = [transform_to_spec(part) for part in self._parts()]
@@ -194,9 +187,6 @@ class TransformedTwin(Layer):
         return TransformedTwin(
             base, observation=self.observation, action=self.action, stateful=self.stateful
         )
-
-    def _base_with_values(self) -> Twin:
-        return self.base.with_parameters(**self.values).with_tensors(self.tensors)
 
 
 def transform_to_spec(transform: Transform) -> dict[str, Any]:

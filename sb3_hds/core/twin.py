@@ -321,9 +321,21 @@ class Twin(abc.ABC):
 
 
 class Layer(Twin):
-    """A twin around another one, whose positions and tangents are those of the inner one."""
+    """
+    Abstract: a twin around another one. Positions, rewards and the end of an episode are those of
+    the inner twin, with the state and the parameters that :meth:`inner_state` and
+    :meth:`inner_params` translate.
+    """
 
     base: Twin
+
+    def inner_state(self, state: State) -> State:
+        """:return: the state as the inner twin has it"""
+        return state
+
+    def inner_params(self, state: State, params: Params) -> Params:
+        """:return: the parameters of the inner twin"""
+        return params
 
     def coordinates(self, q: Position) -> Coordinates:
         return self.base.coordinates(q)
@@ -333,6 +345,30 @@ class Layer(Twin):
 
     def retract(self, state: State, tangent: Tangent) -> State:
         return self.base.retract(state, tangent)
+
+    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        own = self.inner_params(state, params)
+        return self.base.reward(self.inner_state(state), action, self.inner_state(next_state), own)
+
+    def planning_reward(
+        self, state: State, action: Action, next_state: State, params: Params
+    ) -> Scalar:
+        own = self.inner_params(state, params)
+        return self.base.planning_reward(
+            self.inner_state(state), action, self.inner_state(next_state), own
+        )
+
+    def terminated(self, state: State, params: Params) -> Flag:
+        return self.base.terminated(self.inner_state(state), self.inner_params(state, params))
+
+    def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
+        return self.base.sketch(self.inner_state(state), self.inner_params(state, params))
+
+    def _base_with_values(self) -> Twin:
+        """The inner twin with the values and tensors that this layer has for it now."""
+        values = {name: self.values[name] for name in self.base.parameters}
+        tensors = {name: self.tensors[name] for name in self.base.tensors}
+        return self.base.with_parameters(**values).with_tensors(tensors)
 
 
 def layers_of(twin: Twin) -> Iterator[Twin]:

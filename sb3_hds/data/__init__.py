@@ -8,7 +8,7 @@ Names are imported on first use: a loop on a robot needs few of them, and neithe
 
 from typing import TYPE_CHECKING, Any
 
-from sb3_hds.core.trajectories.log_reader import read_logs_by
+from sb3_hds.core.trajectories.storage import register_log_reader
 from sb3_hds.lazy import lazily
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def _load(files: Any, columns: Any) -> "Trajectories":
     return load(files, columns)
 
 
-read_logs_by(_load)
+register_log_reader(_load)
 lazily(
     __name__,
     {

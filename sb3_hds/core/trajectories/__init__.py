@@ -9,18 +9,8 @@ from typing import TYPE_CHECKING
 from sb3_hds.lazy import lazily
 
 if TYPE_CHECKING:
-    from sb3_hds.core.trajectories.log_reader import read_logs_by
     from sb3_hds.core.trajectories.trajectories import Trajectories
 
-__all__ = [
-    "Trajectories",
-    "read_logs_by",
-]
+__all__ = ["Trajectories"]
 
-lazily(
-    __name__,
-    {
-        "log_reader": ("read_logs_by",),
-        "trajectories": ("Trajectories",),
-    },
-)
+lazily(__name__, {"trajectories": ("Trajectories",)})

@@ -1,4 +1,4 @@
-"""Atomic writes of files; arrays are stored without pickle."""
+"""Files: atomic writes, arrays without pickle, and the reader of logs."""
 
 import io
 import os
@@ -6,7 +6,7 @@ import secrets
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,25 @@ import numpy as np
 from sb3_hds.errors import TrajectoryError
 
 _SUFFIX = ".npz"
+
+LogReader = Callable[[Any, Any], Any]
+
+_log_reader: LogReader | None = None
+
+
+def register_log_reader(reader: LogReader) -> None:
+    """
+    Set what ``Trajectories.load`` reads logs with: ``core`` does not import ``data``.
+
+    :param reader: takes files and columns as ``Trajectories.load`` does
+    """
+    global _log_reader
+    _log_reader = reader
+
+
+def log_reader() -> LogReader | None:
+    """:return: the reader; None before ``sb3_hds.data`` is imported"""
+    return _log_reader
 
 
 def check_target(path: str | os.PathLike[str]) -> None:

@@ -21,9 +21,8 @@ from sb3_hds.core.trajectories.episodes import (
     resample,
     same_interval,
 )
-from sb3_hds.core.trajectories.log_reader import log_reader
 from sb3_hds.core.trajectories.replay_buffer import episodes_in
-from sb3_hds.core.trajectories.storage import read_marked, write_npz
+from sb3_hds.core.trajectories.storage import log_reader, read_marked, write_npz
 from sb3_hds.errors import TrajectoryError
 
 _FORMAT, _VERSION = "sb3_hds.Trajectories", 1
