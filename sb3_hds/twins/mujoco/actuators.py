@@ -115,9 +115,9 @@ class _Drives:
         """:return: gears, lengths and speeds"""
         gear: Any = self.gear.astype(moving.v.dtype)
         for i, (link, drive) in enumerate(zip(self.links, self.drives, strict=True)):
-            if drive.outer and link.kind in (BALL, FREE):
-                start, turning = link.q + link.n_q - 4, np.array(link.dofs[-3:])
-                rows = algebra.rotation(tuple(moving.q[start : start + 4]))
+            if drive.outer and link.quaternion:
+                turning = np.array(link.dofs[-3:])
+                rows = algebra.rotation(tuple(moving.q[link.quaternion]))
                 axis = jnp.stack(
                     [jnp.sum(jnp.stack(x) * gear[i, turning]) for x in zip(*rows, strict=True)]
                 )

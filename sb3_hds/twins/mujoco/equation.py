@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from sb3_hds.core import Force, MassMatrix, Params, Position, Velocity
 from sb3_hds.core.numerics.linear import Factor, factorised, solve_factored
-from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Link, Mechanism, Place
+from sb3_hds.twins.mujoco.mechanism import FREE, Link, Mechanism, Place
 from sb3_hds.twins.mujoco.parameters import bodies_of, compensated, gravity_of, of_plant, typical
 from sb3_hds.twins.mujoco.rigid_body.dynamics import (
     Configuration,
@@ -160,13 +160,9 @@ class Equation:
             return change
         parts = []
         for link in self.mechanism.links:
-            start = link.q + (3 if link.kind == FREE else 0)
-            if link.kind in (BALL, FREE):
-                parts.append(change[link.q : start])
-                turn = slice(start, start + 4)
-                parts.append(turning(q[turn], change[turn]))
-            else:
-                parts.append(change[link.q : link.q + 1])
+            parts.append(change[link.straight])
+            if link.quaternion:
+                parts.append(turning(q[link.quaternion], change[link.quaternion]))
         return jnp.concatenate(parts)
 
     # --- its parts
@@ -209,9 +205,8 @@ def _spring(link: Link, q: Array, linear: Any) -> Array:
             stiffness, power = stiffness + coefficient * power, power * far
         return stiffness * way
 
-    rest = jnp.asarray(link.rest, q.dtype)
-    here = q[link.q : link.q + len(link.rest)]
-    if link.kind not in (BALL, FREE):
+    rest, here = jnp.asarray(link.rest, q.dtype), q[link.in_q]
+    if not link.quaternion:
         return pull(here - rest, here - rest)
     turn = turn_between(here[-4:], rest[-4:])
     ways = [here[:3] - rest[:3], turn] if link.kind == FREE else [turn]

@@ -12,7 +12,7 @@ from sb3_hds.twins.mujoco.files.reading import integrator_of, n_actuators, read
 from sb3_hds.twins.mujoco.files.refusals import refuse
 from sb3_hds.twins.mujoco.files.shapes import shapes_of
 from sb3_hds.twins.mujoco.identifiability import unidentifiable
-from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Drive, Link, Mechanism
+from sb3_hds.twins.mujoco.mechanism import Drive, Link, Mechanism
 from sb3_hds.twins.mujoco.twin import MechanismTwin, Reward, Terminated
 
 _KINDS = ("torque", "position", "velocity")
@@ -117,7 +117,7 @@ def _drives(mechanism: Mechanism, wanted: str | Mapping[str, Any]) -> list[Drive
             f"actuators of kind '{kind}' take {', '.join((*gains, 'limit'))}"
             + (f", not {', '.join(unknown)}." if unknown else f"; {missing[0]} is missing.")
         )
-    joints = [link for link in mechanism.links if link.kind not in (BALL, FREE)]
+    joints = [link for link in mechanism.links if not link.quaternion]
     values = {name: _by_joint(name, value, joints) for name, value in given.items()}
     index = {link.joint: i for i, link in enumerate(mechanism.links)}
     found = []

@@ -10,7 +10,6 @@ import numpy as np
 
 from sb3_hds.core import Trajectories
 from sb3_hds.errors import TrajectoryError
-from sb3_hds.twins.mujoco.mechanism import BALL, FREE
 from sb3_hds.twins.mujoco.twin import MechanismTwin
 
 _POSITION, _VELOCITY, _EFFORT, _COMMAND = "position", "velocity", "effort", "command"
@@ -180,7 +179,7 @@ def _signals(twin: MechanismTwin) -> list[tuple[str, str, list[frozenset[str]]]]
         kinds = [frozenset([_COMMAND, kind]), frozenset([_COMMAND])]
         link = twin.mechanism.links[drive.link]
         alone = sum(other.link == drive.link for other in twin.mechanism.drives) == 1
-        joint = link.joint if alone and link.kind not in (BALL, FREE) else drive.name
+        joint = link.joint if alone and not link.quaternion else drive.name
         for _ in drive.inputs:
             own = next(names).name
             found.append(

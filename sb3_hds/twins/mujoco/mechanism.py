@@ -86,6 +86,21 @@ class Link:
         return SIZES[self.kind][0]
 
     @property
+    def in_q(self) -> slice:
+        """:return: its numbers in a position"""
+        return slice(self.q, self.q + self.n_q)
+
+    @property
+    def quaternion(self) -> slice | None:
+        """:return: its quaternion in a position; None for a hinge or slide"""
+        return slice(self.q + self.n_q - 4, self.q + self.n_q) if self.n_q >= 4 else None
+
+    @property
+    def straight(self) -> slice:
+        """:return: its numbers in a position that are lengths or single angles"""
+        return slice(self.q, self.quaternion.start) if self.quaternion else self.in_q
+
+    @property
     def dofs(self) -> tuple[int, ...]:
         """:return: indices of its numbers in a velocity"""
         return tuple(range(self.v, self.v + SIZES[self.kind][1]))

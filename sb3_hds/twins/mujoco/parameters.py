@@ -14,7 +14,6 @@ import numpy as np
 from sb3_hds.core import Parameter
 from sb3_hds.errors import ParameterError, did_you_mean
 from sb3_hds.twins.mujoco.mechanism import (
-    BALL,
     FREE,
     SLIDE,
     SUFFIXES,
@@ -312,7 +311,7 @@ def random_positions(mechanism: Mechanism, n: int, seed: int = 0) -> list[np.nda
     rng = np.random.default_rng(seed)
     found: list[np.ndarray] = []
     for link in mechanism.links:
-        if link.kind in (BALL, FREE):
+        if link.quaternion:
             turns = rng.normal(size=(4, n))
             found += [*rng.normal(size=(3, n))] * (link.kind == FREE)
             found += [*(turns / np.linalg.norm(turns, axis=0))]

@@ -29,7 +29,7 @@ from sb3_hds.core.types import (
 from sb3_hds.errors import ParameterError
 from sb3_hds.twins.mujoco.actuators import Actuation, Moving
 from sb3_hds.twins.mujoco.equation import Equation
-from sb3_hds.twins.mujoco.mechanism import BALL, FREE, SLIDE, Link, Mechanism
+from sb3_hds.twins.mujoco.mechanism import FREE, SLIDE, Mechanism
 from sb3_hds.twins.mujoco.parameters import dof_names, native_effects, of_drives, place_of
 from sb3_hds.twins.mujoco.rigid_body import algebra as alg
 from sb3_hds.twins.mujoco.rigid_body.dynamics import frames_of
@@ -112,7 +112,8 @@ class MechanismTwin(AnalyticTwin):
             Joint(*joint, *limit) for joint, limit in zip(dof_names(mechanism), limits, strict=True)
         )
         self.actuators = tuple(_actuators(mechanism))
-        self.channels = (*_positions(mechanism), *(_velocities(mechanism) * (observe == "qv")))
+        velocities = [Channel(f"{n}_velocity", f"{unit}/s") for n, unit in dof_names(mechanism)]
+        self.channels = (*_positions(mechanism), *(velocities if observe == "qv" else ()))
         self._reward, self._terminated = reward, terminated
         self.integrator = rk4 if mechanism.integrator == "rk4" else semi_implicit_euler
         self._digest = hashlib.sha1(json.dumps(mechanism.to_spec()).encode()).hexdigest()
@@ -172,16 +173,15 @@ class MechanismTwin(AnalyticTwin):
         return self._between(q, self._reference(q)) if self._curved else q
 
     def displace(self, q: Position, way: Velocity) -> Position:
+        if not self._curved:
+            return q + way
         parts = []
         for link in self.mechanism.links:
-            here, ahead = _q(link, q), way[link.v : link.v + len(link.dofs)]
-            if link.kind == FREE:
-                parts += [here[:3] + ahead[:3], turned(here[3:], ahead[3:])]
-            elif link.kind == BALL:
-                parts.append(turned(here, ahead))
-            else:
-                parts.append(here + ahead)
-        return jnp.concatenate(parts) if self._curved else q + way
+            here, ahead = q[link.straight], way[link.v : link.v + len(link.dofs)]
+            parts.append(here + ahead[: len(here)])
+            if link.quaternion:
+                parts.append(turned(q[link.quaternion], ahead[-3:]))
+        return jnp.concatenate(parts)
 
     def difference(self, state: State, reference: State) -> Tangent:
         rest = ravel_pytree(state.memory)[0] - ravel_pytree(reference.memory)[0]
@@ -203,22 +203,17 @@ class MechanismTwin(AnalyticTwin):
             return q - reference
         parts = []
         for link in self.mechanism.links:
-            here, there = _q(link, q), _q(link, reference)
-            if link.kind == FREE:
-                turn = turn_between(here[3:], there[3:])
-                parts += [here[:3] - there[:3], turn]
-            elif link.kind == BALL:
-                parts.append(turn_between(here, there))
-            else:
-                parts.append(here - there)
+            parts.append(q[link.straight] - reference[link.straight])
+            if link.quaternion:
+                parts.append(turn_between(q[link.quaternion], reference[link.quaternion]))
         return jnp.concatenate(parts)
 
     def _reference(self, q: Position) -> Position:
         """Zero of every joint, and no rotation."""
         zero = np.zeros(self.mechanism.n_q)
         for link in self.mechanism.links:
-            if link.kind in (BALL, FREE):
-                zero[link.q + (3 if link.kind == FREE else 0)] = 1.0
+            if link.quaternion:
+                zero[link.quaternion.start] = 1.0
         return jnp.asarray(zero, q.dtype)
 
     # --- measurements
@@ -232,10 +227,9 @@ class MechanismTwin(AnalyticTwin):
     def infer(self, obs: Obs, params: Params) -> State:
         n = self.mechanism.n_q
         q = obs[:n]
-        for link in self.mechanism.links if self._curved else ():
-            if link.kind in (BALL, FREE):
-                at = link.q + (3 if link.kind == FREE else 0)
-                q = q.at[at : at + 4].set(normalized(q[at : at + 4]))
+        for link in self.mechanism.links:
+            if at := link.quaternion:
+                q = q.at[at].set(normalized(q[at]))
         v = obs[n:] if self.observed == "qv" else jnp.zeros(self.mechanism.n_v, obs.dtype)
         return State(q, v, {})
 
@@ -331,10 +325,6 @@ class MechanismTwin(AnalyticTwin):
         return (*super().structure(), *own, self._reward, self._terminated)
 
 
-def _q(link: Link, q: Position) -> Any:
-    return q[link.q : link.q + {FREE: 7, BALL: 4}.get(link.kind, 1)]
-
-
 def _actuators(mechanism: Mechanism) -> list[Actuator]:
     found = []
     for drive in mechanism.drives:
@@ -362,12 +352,8 @@ def _positions(mechanism: Mechanism) -> list[Channel]:
     for link in mechanism.links:
         if link.kind == FREE:
             found += [Channel(f"{link.joint}_{axis}", "m") for axis in "xyz"]
-        if link.kind in (BALL, FREE):
+        if link.quaternion:
             found += [Channel(f"{link.joint}_q{part}", "1") for part in "wxyz"]
         else:
             found.append(Channel(f"{link.joint}_position", "m" if link.kind == SLIDE else "rad"))
     return found
-
-
-def _velocities(mechanism: Mechanism) -> list[Channel]:
-    return [Channel(f"{name}_velocity", f"{unit}/s") for name, unit in dof_names(mechanism)]

@@ -79,7 +79,7 @@ class Tree:
         self.links, self.dtype = links, dtype
         self.n = sum(len(link.dofs) for link in links)
         self.bodies = [i for i, link in enumerate(links) if link.body]
-        self.has_balls = any(link.kind in (BALL, FREE) for link in links)
+        self.has_balls = any(link.quaternion for link in links)
         self.below, own = np.zeros((self.n, self.n), dtype), np.eye(self.n, dtype=dtype)
         carriers: list[list[int]] = []
         for link in links:
@@ -171,11 +171,11 @@ def _through_joint(
             z,
         )
         return alg.transpose(turned), origin, [rotation_about(z, origin)]
-    last = link.q + link.n_q
-    rotation = alg.product(rotation, alg.rotation(q[last - 4 : last]))
+    assert link.quaternion is not None
+    rotation = alg.product(rotation, alg.rotation(q[link.quaternion]))
     axes = [rotation_about(axis, origin) for axis in alg.transpose(rotation)]
     if link.kind == FREE:
-        origin = alg.vadd(origin, q[link.q : link.q + 3])
+        origin = alg.vadd(origin, q[link.straight])
         axes = [*(Motion(alg.ZERO, unit) for unit in _UNIT), *axes]
     return rotation, origin, axes
 
