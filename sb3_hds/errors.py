@@ -1,7 +1,7 @@
 """Errors raised on purpose: each message says what was expected, what came, and the way out."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 
@@ -90,3 +90,9 @@ def did_you_mean(name: str, known: Iterable[str], *, cutoff: float = 0.6) -> str
     """
     close = difflib.get_close_matches(name, list(known), 1, cutoff)
     return f" Did you mean '{close[0]}'?" if close else ""
+
+
+def first_names(names: Sequence[str], n: int = 3) -> str:
+    """:return: the first ``n`` names, and how many more there are"""
+    more = f" and {len(names) - n} more" if len(names) > n else ""
+    return ", ".join(names[:n]) + more

@@ -1,5 +1,7 @@
 """The catalogue of effects: a class listed in ``ALL`` is tested, offered and documented."""
 
+from collections.abc import Iterable
+
 from sb3_hds.core import Effect
 from sb3_hds.effects.actuator import (
     ActionDelay,
@@ -21,11 +23,11 @@ from sb3_hds.effects.joint import (
     ViscousFriction,
 )
 from sb3_hds.effects.nameless import ClearanceSpring, Hysteresis
-from sb3_hds.effects.names import effect_named
 from sb3_hds.effects.neural import NeuralForce, force_of
 from sb3_hds.effects.position import Cogging, ConstantForce, CubicStiffness, Stiffness
 from sb3_hds.effects.sensor import SensorBias, SensorDelay, SensorScale, SignFlip, reversed_joint
 from sb3_hds.effects.transmission import Backlash, JointElasticity
+from sb3_hds.errors import EffectError, did_you_mean
 
 # In the order in which a signal meets them: a bus, then the drive, then its motor; a sensor, then
 # its bus.
@@ -100,3 +102,21 @@ __all__ = [
     "force_of",
     "reversed_joint",
 ]
+
+
+def effect_named(name: str, kinds: Iterable[type[Effect]]) -> type[Effect]:
+    """
+    :param name: ``"coulomb_friction"``, ``"CoulombFriction"`` or ``"coulomb friction"``
+    :param kinds: the classes to search
+    :raises EffectError: for an unknown name; the message suggests the nearest one
+    """
+    by_name = {kind.name: kind for kind in kinds}
+    by_letters = {_letters(known): kind for known, kind in by_name.items()}
+    if _letters(name) in by_letters:
+        return by_letters[_letters(name)]
+    meant = did_you_mean(name.lower(), by_name)
+    raise EffectError(f"There is no effect '{name}'.{meant} There are: {', '.join(by_name)}.")
+
+
+def _letters(name: str) -> str:
+    return "".join(letter for letter in name.rpartition(".")[2].lower() if letter.isalnum())

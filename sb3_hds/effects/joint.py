@@ -1,8 +1,6 @@
 """Friction and drag at a joint."""
 
-import dataclasses
 import math
-from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,11 +17,10 @@ _SHARES = (0.03, 0.1, 0.3, 1.0)
 _BENDS, _STEPS = (0.2, 1.0), 8
 
 
-def _bends_beyond(parameters: Mapping[str, Parameter], standstill: float) -> dict[str, Parameter]:
-    """No curve of friction can be seen to bend at a speed at which it is smoothed."""
+def _bend(standstill: float = STANDSTILL) -> Parameter:
+    """The speed at which a friction curve bends: it shows only above the smoothed range."""
     speed = _FALLS * standstill
-    bend = dataclasses.replace(parameters["v_s"], null=speed, scale=speed, lower=standstill)
-    return {**parameters, "v_s": bend}
+    return Parameter(null=speed, scale=speed, unit="rad/s", lower=standstill)
 
 
 class ViscousFriction(JointEffect):
@@ -105,6 +102,8 @@ class DryFriction(JointEffect):
         if not (isinstance(standstill, int | float) and 0.0 < standstill < math.inf):
             raise EffectError(f"standstill is a positive speed, got {standstill!r}.")
         self.standstill = float(standstill)
+        if "v_s" in self.parameters:
+            self.parameters = {**self.parameters, "v_s": _bend(standstill)}  # type: ignore[misc]
         super().__init__(where, **values)
 
     def against(self, joint: JointMoment, level: Scalar | float) -> Scalar:
@@ -202,20 +201,12 @@ class StribeckFriction(DryFriction):
     parameters = {
         "tau_c": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
         "tau_s": Parameter(null=0.0, scale=0.15, unit="N m", lower=0.0),
-        "v_s": Parameter(
-            null=_FALLS * STANDSTILL, scale=_FALLS * STANDSTILL, unit="rad/s", lower=STANDSTILL
-        ),
+        "v_s": _bend(),
     }
     explanation = "The joint resists most just as it begins to move, and less once it slides."
     source = "Olsson et al. 1998, section 2"
     equivalents = {"coulomb_friction": "while the joint moves several times faster than v_s"}
     ascending = ("tau_c", "tau_s")
-
-    def __init__(
-        self, where: int | str = 0, *, standstill: float = STANDSTILL, **values: float
-    ) -> None:
-        self.parameters = _bends_beyond(type(self).parameters, standstill)  # type: ignore[misc]
-        super().__init__(where, standstill=standstill, **values)
 
     def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
         """From a hump that is narrower than any motion, nothing leads to a wider one."""
@@ -246,9 +237,7 @@ class ConcaveFriction(DryFriction):
     name = "concave_friction"
     parameters = {
         "b": Parameter(null=0.0, scale=0.05, unit="N m s/rad", lower=0.0),
-        "v_s": Parameter(
-            null=_FALLS * STANDSTILL, scale=_FALLS * STANDSTILL, unit="rad/s", lower=STANDSTILL
-        ),
+        "v_s": _bend(),
     }
     explanation = "The joint resists motion the more the faster it is, but less than in proportion."
     source = "Waiboer et al. 2005"
@@ -256,12 +245,6 @@ class ConcaveFriction(DryFriction):
         "viscous_friction": "while the joint moves several times slower than v_s",
         "coulomb_friction": "while the joint moves several times faster than v_s",
     }
-
-    def __init__(
-        self, where: int | str = 0, *, standstill: float = STANDSTILL, **values: float
-    ) -> None:
-        self.parameters = _bends_beyond(type(self).parameters, standstill)  # type: ignore[misc]
-        super().__init__(where, standstill=standstill, **values)
 
     def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
         """A curve that bends below all speeds of the motion, or above them, is another one's."""

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from sb3_hds.errors import first_names
 from sb3_hds.twins.mujoco.parameters import bodies_of, compensated, gravity_of, random_positions
 from sb3_hds.twins.mujoco.rigid_body.dynamics import Tree, configuration, inverse_dynamics
 
@@ -40,11 +41,11 @@ def unidentifiable(twin: "MechanismTwin") -> str:
     together = [names[i] for i, free in zip(seen, alone, strict=True) if not free]
     parts = []
     if nothing:
-        parts.append(f"{len(nothing)} change nothing ({_some(nothing)})")
+        parts.append(f"{len(nothing)} change nothing ({first_names(nothing, _FEW)})")
     if together:
         parts.append(
             f"{len(together)} act only in {len(together) - (len(seen) - rank)} combinations "
-            f"({_some(together)})"
+            f"({first_names(together, _FEW)})"
         )
     if not parts:
         return ""
@@ -86,8 +87,3 @@ def regressor(twin: "MechanismTwin", names: list[str]) -> Float[np.ndarray, "row
         force = inverse_dynamics(tree, at, v, gravity_of(mechanism, values), a)
         columns.append(np.imag(force).ravel() / _STEP)
     return np.stack(columns, 1)
-
-
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - _FEW} more" if len(names) > _FEW else ""
-    return ", ".join(names[:_FEW]) + more

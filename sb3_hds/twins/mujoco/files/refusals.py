@@ -5,14 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from sb3_hds.errors import ModelFileError
+from sb3_hds.errors import ModelFileError, first_names
 from sb3_hds.twins.mujoco.files.reading import n_actuators
 from sb3_hds.twins.mujoco.library import mujoco
 
 #: what may be left out of a twin on request
 IGNORABLE = ("contacts", "equality", "fluid", "limits", "tendons")
-
-_FEW = 3
 
 
 def refuse(model: Any, integrator: str, ignore: Collection[str]) -> None:
@@ -42,19 +40,19 @@ def _ignorable(model: Any) -> dict[str, str]:
     touching = contacts(model)
     if touching:
         found["contacts"] = (
-            f"Contacts can happen ({_some(touching)}), which the twin does not simulate."
+            f"Contacts can happen ({first_names(touching)}), which the twin does not simulate."
         )
     if _enabled(model, "EQUALITY") and model.neq and np.any(model.eq_active0):
         active = [
             model.equality(i).name or f"equality {i}" for i in np.flatnonzero(model.eq_active0)
         ]
         found["equality"] = (
-            f"Constraints close chains or couple joints ({_some(active)}), which the twin does not "
-            "simulate: joints would move apart."
+            f"Constraints close chains or couple joints ({first_names(active)}), which the twin "
+            "does not simulate: joints would move apart."
         )
     if model.ntendon:
         names = [model.tendon(i).name or f"tendon {i}" for i in range(model.ntendon)]
-        found["tendons"] = f"Tendons pull ({_some(names)}), which the twin does not simulate."
+        found["tendons"] = f"Tendons pull ({first_names(names)}), which the twin does not simulate."
     if model.opt.density or model.opt.viscosity:
         found["fluid"] = (
             f"A medium of density {model.opt.density:g} and viscosity {model.opt.viscosity:g} "
@@ -74,8 +72,8 @@ def _never(model: Any, integrator: str) -> list[str]:
     alone = _floating_alone(model)
     if alone and integrator == "implicitfast":
         found.append(
-            f"MuJoCo's implicitfast is another one for a body that floats alone ({_some(alone)}). "
-            "Pass integrator='euler' or 'rk4'."
+            "MuJoCo's implicitfast is another one for a body that floats alone "
+            f"({first_names(alone)}). Pass integrator='euler' or 'rk4'."
         )
     on = {mj.mjtTrn.mjTRN_JOINT, mj.mjtTrn.mjTRN_JOINTINPARENT}
     kinds = {
@@ -94,14 +92,15 @@ def _never(model: Any, integrator: str) -> list[str]:
         names = [model.actuator(i).name or f"actuator {i}" for i in np.flatnonzero(wrong)]
         if names:
             hint = hints.get(words, "Use motors, position, velocity or dcmotor on joints.")
-            found.append(f"The twin has no actuators {words} ({_some(names)}). {hint}")
+            found.append(f"The twin has no actuators {words} ({first_names(names)}). {hint}")
     gravcomp = np.flatnonzero(
         getattr(model, "jnt_actgravcomp", np.zeros(model.njnt)) & model.jnt_actfrclimited
     )
     if len(gravcomp) and np.any(model.body_gravcomp):
         names = [model.joint(int(j)).name for j in gravcomp]
         found.append(
-            f"Actuators with a limit compensate gravity ({_some(names)}). Set actgravcomp='false'."
+            f"Actuators with a limit compensate gravity ({first_names(names)}). "
+            "Set actgravcomp='false'."
         )
     return found
 
@@ -156,8 +155,3 @@ def _special_gains() -> list[Any]:
 def _enabled(model: Any, name: str) -> bool:
     mj = mujoco()
     return not model.opt.disableflags & getattr(mj.mjtDisableBit, f"mjDSBL_{name}")
-
-
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - _FEW} more" if len(names) > _FEW else ""
-    return ", ".join(names[:_FEW]) + more
