@@ -1,11 +1,13 @@
 """Packages whose names are imported on first use."""
 
+import builtins
+import contextlib
 import importlib
 import importlib.util
 import sys
 import threading
-from collections.abc import Iterable, Mapping
-from types import ModuleType
+from collections.abc import Iterator, Mapping
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 
@@ -32,21 +34,37 @@ class _Package(ModuleType):
         return sorted(self._public)
 
 
-def lazily(package: str, public: Mapping[str, Iterable[str]]) -> None:
+@contextlib.contextmanager
+def lazy_imports(package: str) -> Iterator[None]:
     """
-    Called at the end of a package's ``__init__``.
+    Postpone the imports in a ``with`` block of a package's ``__init__``: ``from M import A`` there
+    imports ``M`` when ``A`` is first used.
 
     :param package: its name
-    :param public: names, by the module that they are imported from: below the package, or with
-        its whole name, which begins with ``sb3_hds``
     """
     module: Any = sys.modules[package]
-    homes = {
-        home if home.startswith("sb3_hds.") else f"{package}.{home}": names
-        for home, names in public.items()
-    }
-    module.__dict__["_public"] = {name: home for home, names in homes.items() for name in names}
+    homes: dict[str, str] = {}
+
+    def record(name: str, globals_: Any = None, *arguments: Any, **keywords: Any) -> Any:
+        if globals_ is not module.__dict__:
+            return usual(name, globals_, *arguments, **keywords)
+        names = arguments[1]
+        homes.update(dict.fromkeys(names, name))
+        return SimpleNamespace(**dict.fromkeys(names))
+
+    with _one_at_a_time:
+        usual, builtins.__import__ = builtins.__import__, record
+        try:
+            yield
+        finally:
+            builtins.__import__ = usual
+    for name in homes:
+        del module.__dict__[name]
+    module.__dict__["_public"] = homes
     module.__class__ = _Package
+
+
+_one_at_a_time = threading.RLock()
 
 
 class _Postponed(ModuleType):
@@ -66,9 +84,6 @@ class _Postponed(ModuleType):
         if name in self.__dict__:
             return self.__dict__[name]
         raise AttributeError(f"module '{self.__name__}' has no attribute '{name}'")
-
-
-_one_at_a_time = threading.RLock()
 
 
 def postpone(package: str) -> None:

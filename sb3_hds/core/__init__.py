@@ -4,11 +4,9 @@ The pure JAX core: parameters, effects, twins and data.
 Names are imported on first use: a loop on a robot needs few of them, and neither JAX nor PyTorch.
 """
 
-from typing import TYPE_CHECKING
+from sb3_hds.lazy import lazy_imports
 
-from sb3_hds.lazy import lazily
-
-if TYPE_CHECKING:
+with lazy_imports(__name__):
     from sb3_hds.core.analytic import AnalyticTwin
     from sb3_hds.core.declarations import Actuator, Channel, Joint, Parameter
     from sb3_hds.core.effect import (
@@ -120,60 +118,3 @@ __all__ = [
     "transform_from_spec",
     "transform_to_spec",
 ]
-
-lazily(
-    __name__,
-    {
-        "analytic": ("AnalyticTwin",),
-        "effect": (
-            "ActionEffect",
-            "Effect",
-            "ForceEffect",
-            "JointEffect",
-            "JointMoment",
-            "Moment",
-            "Ranges",
-            "SensorEffect",
-        ),
-        "effect_chain": ("EffectChain", "NO_EFFECTS"),
-        "extended": ("ExtendedTwin",),
-        "numerics.integrators": ("explicit_euler", "rk4", "semi_implicit_euler"),
-        "numerics.linear": ("solve_spd",),
-        "rollout": ("Rollout", "rollout", "rollout_policy"),
-        "declarations": ("Actuator", "Channel", "Joint", "Parameter"),
-        "trajectories": ("Trajectories",),
-        "transformed": (
-            "TRANSFORMS",
-            "TransformedTwin",
-            "seen_through",
-            "transform_from_spec",
-            "transform_to_spec",
-        ),
-        "transforms.barrier": ("Barrier",),
-        "transforms.base": (
-            "ActionTransform",
-            "ObservationTransform",
-            "Signals",
-            "StatefulTransform",
-        ),
-        "transforms.cpg": ("Rhythm",),
-        "transforms.filters": ("Continuity", "Delay", "LowPass", "RateLimit", "Scale"),
-        "transforms.history": ("History",),
-        "transforms.rescale": ("RescaleAction", "RescaleObservation"),
-        "twin": ("State", "Twin"),
-        "types": (
-            "Action",
-            "Coordinates",
-            "Flag",
-            "Force",
-            "MassMatrix",
-            "Memory",
-            "Obs",
-            "Params",
-            "Position",
-            "Scalar",
-            "Tangent",
-            "Velocity",
-        ),
-    },
-)

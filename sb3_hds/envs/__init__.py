@@ -4,11 +4,9 @@ Environments made of twins, and the way back: the twin that mirrors an environme
 Names are imported on first use, so that registering our ids costs neither jax nor torch.
 """
 
-from typing import TYPE_CHECKING
+from sb3_hds.lazy import lazy_imports
 
-from sb3_hds.lazy import lazily
-
-if TYPE_CHECKING:
+with lazy_imports(__name__):
     from sb3_hds.envs.constant_reward import ConstantReward
     from sb3_hds.envs.elastic_quadruped import ElasticQuadruped
     from sb3_hds.envs.ground_truth import true_twin
@@ -33,19 +31,3 @@ __all__ = [
     "twin_of",
     "verify_mirror",
 ]
-
-lazily(
-    __name__,
-    {
-        "constant_reward": ("ConstantReward",),
-        "elastic_quadruped": ("ElasticQuadruped",),
-        "ground_truth": ("true_twin",),
-        "inverted_pendulum_friction": ("InvertedPendulumFriction",),
-        "mirror": ("check_mirrors", "twin_of"),
-        "pendulum_real": ("PendulumReal",),
-        "registration": ("register_environments",),
-        "twin_env": ("TwinEnv",),
-        "twin_vec_env": ("TwinVecEnv",),
-        "verify": ("verify_mirror",),
-    },
-)

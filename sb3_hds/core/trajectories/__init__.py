@@ -4,13 +4,9 @@ Measured data: the type, its files, and where it comes from.
 Names are imported on first use: a loop on a robot needs few of them, and neither JAX nor PyTorch.
 """
 
-from typing import TYPE_CHECKING
+from sb3_hds.lazy import lazy_imports
 
-from sb3_hds.lazy import lazily
-
-if TYPE_CHECKING:
+with lazy_imports(__name__):
     from sb3_hds.core.trajectories.trajectories import Trajectories
 
 __all__ = ["Trajectories"]
-
-lazily(__name__, {"trajectories": ("Trajectories",)})
