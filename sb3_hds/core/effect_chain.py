@@ -11,16 +11,7 @@ import numpy as np
 
 from sb3_hds.core.effect import ActionEffect, Effect, ForceEffect, Moment
 from sb3_hds.core.numerics.linear import solve_spd
-from sb3_hds.core.types import (
-    Action,
-    Force,
-    MassMatrix,
-    Memory,
-    Params,
-    Position,
-    Scalar,
-    Velocity,
-)
+from sb3_hds.core.types import Action, Force, MassMatrix, Memory, Params, Position, Scalar, Velocity
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,13 +21,7 @@ from sb3_hds.core.transforms.filters import Continuity, Delay, LowPass, RateLimi
 from sb3_hds.core.transforms.history import History
 from sb3_hds.core.transforms.rescale import RescaleAction, RescaleObservation
 from sb3_hds.core.twin import Layer, State, Twin
-from sb3_hds.core.types import (
-    Action,
-    Memory,
-    Obs,
-    Params,
-    Scalar,
-)
+from sb3_hds.core.types import Action, Memory, Obs, Params, Scalar
 from sb3_hds.errors import ParameterError
 
 Transform = ObservationTransform | ActionTransform | StatefulTransform

@@ -13,13 +13,14 @@ from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.errors import TwinError
 from sb3_hds.twins import registry
-from sb3_hds.twins.check_result import CheckItem, TwinCheck
+from sb3_hds.twins.check_result import CheckItem, TwinCheck, outcomes
 from sb3_hds.twins.mechanics import ROUNDING, Points, check_mechanics, precision
 
 _N_STARTS, _N_STEPS = 16, 20
 _N_POINTS = 64  # at which the terms of the equation of motion are compared
 _OWN, _GENERIC = 0, 1  # the first two variants of the parameters
 _TINY = 1e-300
+_UNMENDED = "everything else, before that is mended"
 # In the order in which they are blamed: a later one uses what an earlier one returns.
 _METHODS = (
     "step", "observe", "infer", "observe(infer(obs))", "terminated", "reward", "planning_reward"
@@ -61,14 +62,12 @@ def check(twin: Twin | type[Twin] | str, *, seed: int = 0) -> TwinCheck:
         raise TypeError(f"twins.check takes a twin, its class or its name, got {twin!r}.")
     contract = _contract(made)
     if not contract.ok:
-        return TwinCheck(made.name, (contract,), "everything else, before that is mended")
+        return TwinCheck(made.name, (contract,), _UNMENDED)
     with jax.enable_x64(True):
         samples = _sampled(made, seed)
         finite = _finite(samples)
         if not finite.ok:
-            return TwinCheck(
-                made.name, (contract, finite), "everything else, before that is mended"
-            )
+            return TwinCheck(made.name, (contract, finite), _UNMENDED)
         items = [contract, finite, _inverse(made, samples), _parameters(made, samples)]
         items += [_commands(made, samples)] if made.actuators else []
         plant = plant_of(made)
@@ -196,18 +195,18 @@ def _limits(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _contract(twin: Twin) -> CheckItem:
-    name = "shapes and dtypes"
+    passed, failed = outcomes("shapes and dtypes")
     try:
         check_methods(twin)
         for layer in reversed(list(layers_of(twin))):
             check_now(layer)
     except TwinError as error:
-        return CheckItem(name, False, str(error))
-    return CheckItem(name, True, "what every method returns, in single and double precision")
+        return failed(str(error))
+    return passed("what every method returns, in single and double precision")
 
 
 def _finite(samples: _Samples) -> CheckItem:
-    name = "finite"
+    passed, failed = outcomes("finite")
     values = {"step": np.concatenate(samples.states[:2], -1)[:, :, 1:], **samples.seen}
     values = {method: values[method] for method in _METHODS}
     for variant, label in enumerate(samples.names):
@@ -218,9 +217,7 @@ def _finite(samples: _Samples) -> CheckItem:
             if bad.any():
                 after = int(bad.any((0, 2)).argmax()) + 1
                 where = f"with {label}" if n_steps == 1 else f"with {_variant_in_words(label)}"
-                return CheckItem(
-                    name,
-                    False,
+                return failed(
                     f"{method} is not finite after {after} of {_N_STEPS} steps {where}",
                     f"Move the bound of {label.partition(' = ')[0]} to where the twin still works."
                     if n_steps == 1
@@ -234,15 +231,11 @@ def _finite(samples: _Samples) -> CheckItem:
         )
     ]
     if steep:
-        return CheckItem(
-            name,
-            False,
+        return failed(
             f"the derivative of {steep[0]} is not finite at a state that is visited",
             "A root or a norm has none at zero: write sqrt(x**2 + 1e-12), or jnp.where before it.",
         )
-    return CheckItem(
-        name,
-        True,
+    return passed(
         f"{_N_STARTS} motions of {_N_STEPS} steps under random commands, their derivatives, and a "
         "step with each parameter at its bounds",
     )
@@ -254,7 +247,7 @@ def _variant_in_words(variant: str) -> str:
 
 
 def _inverse(twin: Twin, samples: _Samples) -> CheckItem:
-    name = "infer inverts observe"
+    passed, failed = outcomes("infer inverts observe")
     obs, again, inferred = (
         samples.seen[key][_GENERIC].reshape(_N_STARTS * _N_STEPS, -1)
         for key in ("observe", "observe(infer(obs))", "infer")
@@ -263,9 +256,7 @@ def _inverse(twin: Twin, samples: _Samples) -> CheckItem:
     error = (np.abs(again - obs) / size).max(0)
     worst = int(error.argmax())
     if not error.max() < ROUNDING:
-        return CheckItem(
-            name,
-            False,
+        return failed(
             f"observe(infer(obs)) differs from obs in '{twin.channels[worst].name}' by "
             f"{error[worst]:.1%} of its largest value",
             "infer has to put each channel back where observe took it from.",
@@ -279,9 +270,7 @@ def _inverse(twin: Twin, samples: _Samples) -> CheckItem:
         if _apart(a - b, what == "position" and joint.unit == "rad") > ROUNDING * np.abs(b).max()
     ]
     found = f"observe(infer(obs)) equals obs {precision(error.max())}"
-    return CheckItem(
-        name, True, f"{found}; infer does not recover {', '.join(lost)}" if lost else found
-    )
+    return passed(f"{found}; infer does not recover {', '.join(lost)}" if lost else found)
 
 
 def _apart(change: np.ndarray, angle: bool) -> float:
@@ -291,33 +280,30 @@ def _apart(change: np.ndarray, angle: bool) -> float:
 
 
 def _parameters(twin: Twin, samples: _Samples) -> CheckItem:
-    name = "parameters"
+    passed, failed = outcomes("parameters")
     effects = {parameter: _effect(samples, f"value {parameter}") for parameter in twin.parameters}
     outside = [n for n, p in twin.parameters.items() if not p.lower <= twin.values[n] <= p.upper]
     if outside:
-        return CheckItem(name, False, f"out of bounds: {', '.join(outside)}", "Set other values.")
+        return failed(f"out of bounds: {', '.join(outside)}", "Set other values.")
     idle = [parameter for parameter, effect in effects.items() if not effect > ROUNDING]
     if idle:
-        return CheckItem(
-            name,
-            False,
+        return failed(
             f"without effect on motion, observation and reward: {', '.join(idle)}",
             "Methods take values from params, never from self. Leave out what nothing uses.",
         )
-    return CheckItem(name, True, f"within their bounds, and each has an effect{_least(effects)}")
+    return passed(f"within their bounds, and each has an effect{_least(effects)}")
 
 
 def _commands(twin: Twin, samples: _Samples) -> CheckItem:
+    passed, failed = outcomes("commands")
     effects = {a.name: _effect(samples, f"command {a.name}") for a in twin.actuators}
     idle = [actuator for actuator, effect in effects.items() if not effect > ROUNDING]
     if idle:
-        return CheckItem(
-            "commands",
-            False,
+        return failed(
             f"without effect on the motion: {', '.join(idle)}",
             "Use each entry of the action in actuate, within its limits low and high.",
         )
-    return CheckItem("commands", True, f"each has an effect{_least(effects)}")
+    return passed(f"each has an effect{_least(effects)}")
 
 
 def _least(effects: dict[str, float]) -> str:

@@ -2,6 +2,8 @@
 
 import dataclasses
 import textwrap
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 _WIDTH = 80
@@ -21,6 +23,14 @@ class CheckItem(NamedTuple):
     ok: bool
     found: str
     way_out: str = ""
+
+
+def outcomes(name: str) -> tuple[Callable[..., CheckItem], Callable[..., CheckItem]]:
+    """
+    :param name: of a check
+    :return: constructors of its item where it passed, and where it failed
+    """
+    return partial(CheckItem, name, True), partial(CheckItem, name, False)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from sb3_hds.core import AnalyticTwin, Params, Position, Scalar, State, Velocity
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
-from sb3_hds.twins.check_result import CheckItem
+from sb3_hds.twins.check_result import CheckItem, outcomes
 
 # Rounding in double precision, through a few hundred operations.
 ROUNDING = 1e-9
@@ -82,14 +82,12 @@ def _power(plant: AnalyticTwin, params: Params, q: Position, v: Velocity) -> tup
 
 
 def _mass_item(plant: AnalyticTwin, mass: Float[np.ndarray, "points dof dof"]) -> CheckItem:
-    name = "mass matrix"
+    passed, failed = outcomes("mass matrix")
     size = np.maximum(np.abs(mass).max((1, 2), keepdims=True), _TINY)
     apart = np.abs(mass - mass.transpose(0, 2, 1)) / size
     if apart.max() > ROUNDING:
         _, i, j = np.unravel_index(apart.argmax(), apart.shape)
-        return CheckItem(
-            name,
-            False,
+        return failed(
             f"not symmetric: entry ({plant.joints[i].name}, {plant.joints[j].name}) differs from "
             f"its mirror image by {apart.max():.1%} of the largest entry",
             "Write both from the same expression.",
@@ -97,74 +95,65 @@ def _mass_item(plant: AnalyticTwin, mass: Float[np.ndarray, "points dof dof"]) -
     diagonal = np.einsum("nii->ni", mass)
     if diagonal.min() <= 0.0:
         joint = plant.joints[int(diagonal.min(0).argmin())].name
-        return CheckItem(
-            name,
-            False,
+        return failed(
             f"not positive definite: {joint} has an inertia of {diagonal.min():.3g}",
             "Look at its sign, and at the lower bounds of the parameters that it is made of.",
         )
     scale = np.sqrt(diagonal)
     least = np.linalg.eigvalsh(mass / scale[:, :, None] / scale[:, None, :]).min()
     if least <= ROUNDING:
-        return CheckItem(
-            name,
-            False,
+        return failed(
             f"not positive definite: smallest eigenvalue {least:.2g} where the diagonal is one",
             "What couples two joints must stay below the root of the product of their inertias.",
         )
     found = f"at {len(mass)} points, smallest eigenvalue {least:.2g} where the diagonal is one"
-    return CheckItem(name, True, f"symmetric and positive definite ({found})")
+    return passed(f"symmetric and positive definite ({found})")
 
 
 def _potential_item(plant: AnalyticTwin, slopes: Float[np.ndarray, "points dof dof"]) -> CheckItem:
-    name = "gravity and springs"
+    passed, failed = outcomes("gravity and springs")
     apart = np.abs(slopes - slopes.transpose(0, 2, 1)) / np.maximum(np.abs(slopes).max(), _TINY)
     if apart.max() > ROUNDING:
         n, i, j = np.unravel_index(apart.argmax(), apart.shape)
         first, second = plant.joints[i].name, plant.joints[j].name
-        return CheckItem(
-            name,
-            False,
+        return failed(
             f"bias(q, 0) has no potential: the load of {first} changes with {second} by "
             f"{slopes[n, i, j]:.3g}, that of {second} with {first} by {slopes[n, j, i]:.3g}, and "
             "in a mechanical system these are equal",
             f"Derive both loads from one energy: look at the terms that hold {first} and {second}.",
         )
     if len(plant.joints) == 1:
-        return CheckItem(name, True, "bias(q, 0) has a potential, as with any single joint")
+        return passed("bias(q, 0) has a potential, as with any single joint")
     found = f"its Jacobian is symmetric {precision(apart.max())}"
-    return CheckItem(name, True, f"bias(q, 0) has a potential: {found}")
+    return passed(f"bias(q, 0) has a potential: {found}")
 
 
 def _power_item(shares: Float[np.ndarray, "points speeds"]) -> CheckItem:
     """:param shares: of the power in the size of its parts"""
-    name = "forces of inertia"
+    passed, failed = outcomes("forces of inertia")
     if shares.max() > ROUNDING:
-        return CheckItem(
-            name,
-            False,
+        return failed(
             "they add energy: v'(dM/dt v / 2 - bias(q, v) + bias(q, 0)) is positive, up to "
             f"{shares.max():.0%} of its parts, where it must be zero, or negative with damping",
             "Coriolis and centrifugal forces follow from the mass matrix, as dM/dt v - d(v'M v / "
             "2)/dq, and damping is + d v: look at signs and factors in bias.",
         )
     if shares.min() < -ROUNDING:
-        return CheckItem(name, True, "they do no work, and the twin's own damping dissipates")
-    return CheckItem(name, True, f"they do no work, {precision(np.abs(shares).max())}; no damping")
+        return passed("they do no work, and the twin's own damping dissipates")
+    return passed(f"they do no work, {precision(np.abs(shares).max())}; no damping")
 
 
 def _energy_item(plant: AnalyticTwin, points: Points) -> CheckItem:
     """Integrate without actuators, and compare the energy with what damping leaves of it."""
-    name, h = "energy", plant.dt / plant.substeps
+    passed, failed = outcomes("energy")
+    h = plant.dt / plant.substeps
     n = min(max(plant.substeps, _LEAST_SUBSTEPS), _MOST_SUBSTEPS)
     first = jax.tree.map(lambda values: values[:_N_FREE], points)
     errors: list[float] = []
     for finer in _FINER:
         error, size = _compiled(jax.vmap(_balance(plant, h / finer, n, finer)))(*first)
         if not np.isfinite(error).all():
-            return CheckItem(
-                name,
-                False,
+            return failed(
                 f"undriven, the motion is not finite after {n} sub-steps of {h:g} s",
                 "Take more sub-steps, or rk4 as the integrator.",
             )
@@ -175,20 +164,18 @@ def _energy_item(plant: AnalyticTwin, points: Points) -> CheckItem:
             break
     found = f"undriven for {n} sub-steps of {h:g} s, off by {errors[0]:+.0e} of the largest energy"
     if len(errors) == 1:
-        return CheckItem(name, True, found)
+        return passed(found)
     found += f", by {errors[-1]:+.0e} with sub-steps {_FINER[len(errors) - 1]} times as short"
     if falls:
-        return CheckItem(name, True, f"{found}: the integrator's error")
+        return passed(f"{found}: the integrator's error")
     clips = [
         method
         for method in ("limit", "limit_velocity")
         if getattr(type(plant), method) is not getattr(AnalyticTwin, method)
     ]
     if clips and errors[-1] < 0.0:
-        return CheckItem(name, True, f"{found}: {' and '.join(clips)} dissipates")
-    return CheckItem(
-        name,
-        False,
+        return passed(f"{found}: {' and '.join(clips)} dissipates")
+    return failed(
         f"{found}, which is no error of the integrator",
         "Look at the integrator, and at step, limit and limit_velocity, if the twin has its own.",
     )

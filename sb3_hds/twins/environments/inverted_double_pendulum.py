@@ -6,18 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State, rk4
-from sb3_hds.core.types import (
-    Action,
-    Flag,
-    Force,
-    MassMatrix,
-    Obs,
-    Params,
-    Position,
-    Scalar,
-    Velocity,
-)
+from sb3_hds.core import Actuator, AnalyticTwin, Channel, Flag, Joint, Parameter, State, rk4
+from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position, Scalar, Velocity
 from sb3_hds.twins.environments import cart_and_poles
 
 _MAX_REPORTED = 10.0  # [m/s], [rad/s]
