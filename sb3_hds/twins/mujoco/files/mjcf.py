@@ -10,13 +10,18 @@ from typing import Any
 import numpy as np
 
 from sb3_hds.errors import ModelFileError
-from sb3_hds.twins.mujoco.files.correction import DIGITS, OF_JOINTS, Correction, changed_bodies
+from sb3_hds.twins.mujoco.files.correction import (
+    DIGITS,
+    OF_JOINTS,
+    Correction,
+    changed_bodies,
+    in_body_frame,
+)
 from sb3_hds.twins.mujoco.files.load import spec_of
 from sb3_hds.twins.mujoco.files.reading import read
 from sb3_hds.twins.mujoco.library import mujoco
 from sb3_hds.twins.mujoco.mechanism import Drive, Link, Mechanism
 from sb3_hds.twins.mujoco.parameters import gravity_of
-from sb3_hds.twins.mujoco.rigid_body import algebra as alg
 
 # Share of a joint's motion that its dry friction may stop in a step: MuJoCo's impedance.
 _DAMPED = 0.99
@@ -158,14 +163,13 @@ def _write_effects(correction: Correction, spec: Any, actuators: list[Any]) -> N
     step = float(spec.option.timestep)
     for name, index, key, own in correction.effects:
         single = name in _OF_ACTUATORS and index in firsts[:-1]
-        row = firsts.index(index) if single else -1
-        alone = single and len(correction.mechanism.drives[row].inputs) == 1
-        if alone and _OF_ACTUATORS[name](
-            actuators[row], correction.mechanism.drives[row], own, step
-        ):
-            correction.changed += [f"{key}.{short}: {value:.6g}" for short, value in own.items()]
-        else:
-            correction.left_out += [f"{key}.{short}: {value:.6g}" for short, value in own.items()]
+        written = False
+        if single:
+            row = firsts.index(index)
+            drive = correction.mechanism.drives[row]
+            alone = len(drive.inputs) == 1
+            written = alone and _OF_ACTUATORS[name](actuators[row], drive, own, step)
+        correction.record_effect(key, own, written=written)
 
 
 def _write_delay(actuator: Any, drive: Drive, own: Mapping[str, float], step: float) -> bool:
@@ -233,25 +237,21 @@ def _write_bodies(correction: Correction, spec: Any, model: Any) -> None:
     for i, new in wanted.items():
         link = mechanism.links[i]
         assert link.body is not None
-        own = [b for b, at in link_of.items() if at == i and model.body_mass[b] > 0.0]
-        first = own[0]
-        turn, origin = np.array(link.body.rotation), np.array(link.body.origin)
-        # Of the whole, in the frame of the first body: mass, first and second moments.
-        mass = float(new.mass)
-        centre = turn.T @ (np.array([float(x) for x in new.centre]) - origin)
-        second = turn.T @ np.array(alg.full(new.second_moments), float) @ turn
+        first, *others = (b for b, at in link_of.items() if at == i and model.body_mass[b] > 0.0)
+        # Total mass, first and second moments in the frame of the first body, ...
+        mass, centre, second = in_body_frame(link.body, new)
         second = second + mass * np.outer(centre, centre)
         axes, at = data.xmat[first].reshape(3, 3), data.xpos[first]
         moment = mass * centre
-        for b in own[1:]:
+        # ... less those of the other bodies.
+        for b in others:
             other, held = data.ximat[b].reshape(3, 3), float(model.body_mass[b])
             place = axes.T @ (data.xipos[b] - at)
             inertia = axes.T @ other @ np.diag(model.body_inertia[b]) @ other.T @ axes
             mass, moment = mass - held, moment - held * place
             second = second - (0.5 * np.trace(inertia) * np.eye(3) - inertia)
             second = second - held * np.outer(place, place)
-        body = by_id[first]
-        _write_inertial(correction, body, mass, moment, second)
+        _write_inertial(correction, by_id[first], mass, moment, second)
 
 
 def _write_inertial(
