@@ -154,7 +154,7 @@ def test_the_derivative_of_a_solution_is_the_implicit_one(x64):
 
 def test_a_least_pivot_replaces_a_negative_one_and_leaves_good_ones(x64):
     indefinite, right = jnp.diag(jnp.array([2.0, -1.0])), jnp.ones(2)
-    np.testing.assert_allclose(solve_spd(indefinite, right, least_pivot=0.1), [0.5, 10.0])
+    np.testing.assert_allclose(solve_spd(indefinite, right, min_pivot=0.1), [0.5, 10.0])
 
 
 def test_the_inertia_of_a_joint_is_what_a_force_there_accelerates(x64):

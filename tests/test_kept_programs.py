@@ -118,11 +118,11 @@ def test_a_jax_that_opens_its_folder_otherwise_keeps_nothing(fresh_settings, mon
 
     monkeypatch.setenv("SB3_HDS_CACHE", str(tmp_path))
     monkeypatch.delattr(compilation_cache, "get_file_cache")
-    compilation._offered.cache_clear()
+    compilation._hook_into_jax.cache_clear()
     try:
         assert keep_programs() is None
     finally:
-        compilation._offered.cache_clear()
+        compilation._hook_into_jax.cache_clear()
     assert jax.config.values["jax_compilation_cache_dir"] is None
 
 
@@ -164,7 +164,7 @@ def test_what_is_not_as_it_was_written_is_not_there(damage, tmp_path):
 
 
 def test_programs_that_were_not_used_for_longest_make_room(tmp_path):
-    programs = Programs(tmp_path, most=300)
+    programs = Programs(tmp_path, max_size=300)
     now = time.time()
     for i in range(3):
         programs.put(f"program_{i}", bytes([i]) * 100)
@@ -172,7 +172,7 @@ def test_programs_that_were_not_used_for_longest_make_room(tmp_path):
         os.utime(path, (now - 100 + i, now - 100 + i))
     assert programs.get("program_0") == bytes(100)
 
-    Programs(tmp_path, most=300).put("program_3", b"3" * 100)
+    Programs(tmp_path, max_size=300).put("program_3", b"3" * 100)
 
     kept = [i for i in range(4) if programs.get(f"program_{i}") is not None]
     assert kept == [0, 3]

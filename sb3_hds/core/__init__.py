@@ -1,7 +1,7 @@
 """
 The pure JAX core: parameters, effects, twins and data.
 
-Names are imported on first use: a loop on a robot needs few of them, and neither JAX nor PyTorch.
+Names are imported on first use, so that a control loop on a robot needs neither JAX nor PyTorch.
 """
 
 from sb3_hds.lazy import lazy_imports

@@ -1,4 +1,4 @@
-"""A twin behind a wrapper, which is again a twin."""
+"""A twin whose observations or actions pass through a wrapper."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -26,7 +26,14 @@ from sb3_hds.errors import ParameterError
 
 Transform = ObservationTransform | ActionTransform | StatefulTransform
 
-#: The transforms that can be rebuilt from saved data without naming their classes.
+# Arguments of ``TransformedTwin``, and the transforms that they take.
+_KINDS = {
+    "observation": ObservationTransform,
+    "action": ActionTransform,
+    "stateful": StatefulTransform,
+}
+
+#: the transforms that saved data can name
 TRANSFORMS: tuple[type[Transform], ...] = (
     RescaleAction,
     RescaleObservation,
@@ -46,15 +53,15 @@ class TransformedTwin(Layer):
     A twin whose observations or actions pass through a wrapper. Parameters, states and rewards are
     those of the wrapped twin; a stateful wrapper adds its memory and its penalty.
 
-    Effects belong to the plant: :meth:`extend` attaches them to the twin below the wrapper, where
-    commands and measurements have their physical units.
+    Effects belong to the plant: :meth:`extend` attaches them to the wrapped twin, where commands
+    and measurements have their physical units.
 
-    :param base: the twin below
+    :param base: the wrapped twin
     :param observation: transform of observations; None: identity
     :param action: transform of actions; None: identity
     :param stateful: transform of both, with memory or access to the observation; excludes the
         other two
-    :raises ParameterError: if a transform does not fit the twin below, or comes with another
+    :raises ParameterError: if a transform does not fit the twin, or comes with another one
     """
 
     def __init__(
@@ -84,13 +91,13 @@ class TransformedTwin(Layer):
             self.actuators = action.actuators(base.actuators)
 
     def extend(self, *effects: Effect) -> "TransformedTwin":
-        return self._around(self._base_with_values().extend(*effects))
+        return self._with_base(self._base_with_values().extend(*effects))
 
     def without(self, *keys: str) -> "TransformedTwin":
-        return self._around(self._base_with_values().without(*keys))
+        return self._with_base(self._base_with_values().without(*keys))
 
     def at_interval(self, dt: float, substeps: int) -> "TransformedTwin":
-        return self._around(self._base_with_values().at_interval(dt, substeps))
+        return self._with_base(self._base_with_values().at_interval(dt, substeps))
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         state = self.base.initial(key, params)
@@ -98,12 +105,12 @@ class TransformedTwin(Layer):
             return state
         obs = self.base.observe(state, params)
         drawn = self.stateful.draw(jax.random.fold_in(key, 1), obs, self._below)
-        return self._remembering(state, drawn)
+        return self._with_memory(state, drawn)
 
     def infer(self, obs: Obs, params: Params) -> State:
         if self.stateful is not None:
             inside, memory = self.stateful.infer(obs, self._below)
-            return self._remembering(self.base.infer(inside, params), memory)
+            return self._with_memory(self.base.infer(inside, params), memory)
         if self.observation is not None:
             obs = self.observation.invert(obs, self.base.channels)
         return self.base.infer(obs, params)
@@ -124,7 +131,7 @@ class TransformedTwin(Layer):
             return self.base.step(state, command, params, effects)
         inside = {key: own for key, own in state.memory.items() if key != self._key}
         after = self.base.step(state._replace(memory=inside), command, params, effects)
-        return self._remembering(after, memory)
+        return self._with_memory(after, memory)
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
         command = self.command(state, action, params)
@@ -170,14 +177,14 @@ class TransformedTwin(Layer):
         obs = self.base.observe(state, params)
         return self.stateful.cost(action, obs, state.memory[self._key], self._below)
 
-    def _remembering(self, state: State, memory: Memory) -> State:
+    def _with_memory(self, state: State, memory: Memory) -> State:
         return state._replace(memory=state.memory | {self._key: memory})
 
     def _parts(self) -> list[Transform]:
         parts = (self.observation, self.action, self.stateful)
         return [part for part in parts if part is not None]
 
-    def _around(self, base: Twin) -> "TransformedTwin":
+    def _with_base(self, base: Twin) -> "TransformedTwin":
         return TransformedTwin(
             base, observation=self.observation, action=self.action, stateful=self.stateful
         )
@@ -194,8 +201,8 @@ def transform_from_spec(
 ) -> Transform:
     """
     :param spec: what :func:`transform_to_spec` returned
-    :param known: the classes among which the transform is found by name
-    :raises ParameterError: if it is not among them
+    :param known: the classes that the names of transforms stand for
+    :raises ParameterError: for the name of another transform
     """
     by_name = {transform.name: transform for transform in known}
     if spec["transform"] not in by_name:
@@ -215,25 +222,20 @@ def seen_through(
     """
     Rebuild the saved wrappers around a twin.
 
-    :param base: the twin below all of them
-    :param layers: ``to_spec()["transforms"]``, the wrapper next to ``base`` first
-    :param known: the classes among which transforms are found by name
-    :raises ParameterError: if a transform is not among them, or does not fit the twin below
+    :param base: the innermost twin
+    :param layers: ``to_spec()["transforms"]``, the innermost wrapper first
+    :param known: the classes that the names of transforms stand for
+    :raises ParameterError: for another transform, or one that does not fit the twin
     """
     for layer in layers:
-        parts = (transform_from_spec(part, known) for part in layer)
-        placed: dict[str, Any] = {_place_of(part): part for part in parts}
+        parts = [transform_from_spec(part, known) for part in layer]
+        placed: Any = {
+            n: part for n, kind in kinds.items() for part in parts if isinstance(part, kind)
+        }
         base = TransformedTwin(base, **placed)
     return base
 
 
-def _place_of(transform: Transform) -> str:
-    """The argument of ``TransformedTwin`` for a transform."""
-    if isinstance(transform, StatefulTransform):
-        return "stateful"
-    return "observation" if isinstance(transform, ObservationTransform) else "action"
-
-
 def _depth(base: Twin) -> int:
-    """Number of wrappers around the plant; it makes the keys of memories unique."""
+    """Number of wrappers around the plant, which makes the keys of memories unique."""
     return 1 + _depth(base.base) if isinstance(base, TransformedTwin) else 0

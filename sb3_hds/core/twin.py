@@ -52,19 +52,19 @@ class Twin(abc.ABC):
     """
     A differentiable simulator of one system.
 
-    Its methods are pure and unbatched, and safe under ``jit``, ``vmap``, ``scan`` and forward-mode
-    differentiation; callers do the batching. Values of parameters are always passed in ``params``;
-    a method never reads them from ``self``. Twins that differ in nothing else are therefore equal
-    and share one compiled program.
+    Its methods are pure and unbatched (callers ``vmap``), and safe under ``jit``, ``vmap``,
+    ``scan`` and forward-mode differentiation. Values of parameters are always passed in ``params``;
+    a method never reads them from ``self``. Twins that differ only in them are therefore equal and
+    share one compiled program.
 
     A subclass declares its signals and parameters as class attributes and implements the abstract
     methods. Mechanical systems with a mass matrix are shorter as an ``AnalyticTwin``.
 
     :param dt: control interval [s]; default: the class attribute
     :param substeps: internal steps per control interval; default: the class attribute
-    :param settings: values of parameters by name, and of the options that the class declares
-    :raises ParameterError: for a name that is neither, a value out of bounds, or an impossible step
-    :raises TwinError: for a class without name, or whose parameters are no ``Parameter``
+    :param settings: values of parameters and of the class's options, by name
+    :raises ParameterError: for an unknown name, a value out of bounds, or an impossible step
+    :raises TwinError: for a class without a name, or whose parameters are no ``Parameter``
     """
 
     name: str
@@ -76,19 +76,19 @@ class Twin(abc.ABC):
     channels: tuple[Channel, ...]
     parameters: Mapping[str, Parameter]
     max_episode_steps: int | None = None
-    #: ``"reverse"`` where reverse mode works too, ``"forward"`` where only forward mode does.
+    #: ``"reverse"`` if reverse mode works, too; ``"forward"`` if only forward mode does
     differentiability: str = "reverse"
-    #: False where the reward is flat almost everywhere: then override ``planning_reward``.
+    #: False if the reward is flat almost everywhere: then override ``planning_reward``
     reward_has_gradient: bool = True
     #: (effect name, index of its place) -> {its parameter: the twin's parameter that it adds to, or
-    #: multiplies where the effect is absent at one}
+    #: multiplies if the effect's null is one}
     native_effects: Mapping[tuple[str, int], Mapping[str, str]] = {}
-    #: Parameters that are known exactly: a diagnosis takes them as given, and a calibration keeps
-    #: them unless it is asked to estimate them.
+    #: parameters that are known exactly: a diagnosis does not suspect them, and a calibration
+    #: estimates them only on request
     known_parameters: frozenset[str] = frozenset()
-    #: Structural choices with their defaults, set by keyword: ``{"goal": "stop"}``.
+    #: structural choices with their defaults, set by keyword: ``{"goal": "stop"}``
     options: ClassVar[Mapping[str, Any]] = {}
-    #: Learned arrays of attached effects, by full name: pytrees that travel with the parameters.
+    #: learned arrays of attached effects, by full name: pytrees that are passed in ``params``
     tensors: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(
@@ -113,13 +113,13 @@ class Twin(abc.ABC):
 
     @property
     def params(self) -> Params:
-        """The current values of all parameters: what every method takes as ``params``."""
+        """The current values of all parameters, as every method takes them in ``params``."""
         return {**self.values, **self.tensors}
 
     def with_parameters(self: _Twin, **values: float) -> _Twin:
         """
         :param values: new values by full name, in the units of ``parameters``
-        :return: the same twin with these values; equal to this one for the compiler
+        :return: a copy with these values, which compares equal: it shares compiled programs
         :raises ParameterError: for an unknown name or a value out of bounds
         """
         changed = copy.copy(self)
@@ -130,7 +130,7 @@ class Twin(abc.ABC):
     def with_tensors(self: _Twin, tensors: Mapping[str, Any]) -> _Twin:
         """
         :param tensors: new arrays by full name, of the same shapes
-        :return: the same twin with these arrays; equal to this one for the compiler
+        :return: a copy with these arrays, which compares equal
         :raises ParameterError: for an unknown name
         """
         unknown = set(tensors) - set(self.tensors)
@@ -154,7 +154,7 @@ class Twin(abc.ABC):
         return changed
 
     def extend(self, *effects: Effect) -> "Twin":
-        """:return: this twin plus ``effects``, in the order in which a signal meets them"""
+        """:return: this twin with ``effects`` attached, in the order of the signal path"""
         from sb3_hds.core.extended import ExtendedTwin
 
         return ExtendedTwin(self, *effects)
@@ -181,8 +181,8 @@ class Twin(abc.ABC):
 
     def typical_forces(self) -> tuple[float, ...]:
         """
-        :return: the largest force of actuators and gravity on each joint at rest [N m] or [N], a
-            scale for friction and the like; 0 where it is unknown
+        :return: the largest force of actuators and gravity on each joint at rest [N m] or [N], as a
+            scale for effects; 0 if unknown
         """
         return (0.0,) * len(self.joints)
 
@@ -195,7 +195,7 @@ class Twin(abc.ABC):
         """
         The state that corresponds to an observation: the inverse of :meth:`observe`.
 
-        Unobserved parts are set to zero, and the subclass documents which they are.
+        Unobserved parts are set to zero; the subclass documents which ones.
         """
 
     @abc.abstractmethod
@@ -210,39 +210,38 @@ class Twin(abc.ABC):
         Advance by one control interval ``dt``.
 
         :param action: in the units of the action space; clipped to it as the environment does
-        :param effects: attached effects, to be evaluated at every internal sub-step
+        :param effects: attached effects, evaluated at every sub-step
         """
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        """The reward of the environment for this step; zero where there is no task."""
+        """The reward of the environment for this step; zero without a task."""
         return jnp.zeros(())
 
     def planning_reward(
         self, state: State, action: Action, next_state: State, params: Params
     ) -> Scalar:
         """
-        The objective of planning: the reward, or a smooth surrogate where that has no gradient.
+        The objective of planning: the reward, or a smooth surrogate if that has no gradient.
 
-        It counts up to and including the terminating step and is zero afterwards. Where survival is
-        the goal it must therefore be positive; otherwise planning learns to terminate early.
+        It counts up to and including the terminating step. If survival is the goal, it must be
+        positive: otherwise planning learns to terminate early.
         """
         return self.reward(state, action, next_state, params)
 
     def terminated(self, state: State, params: Params) -> Flag:
-        """Whether the task ends in this state; time limits do not count."""
+        """Whether the state terminates the task; time limits do not count."""
         return jnp.zeros((), bool)
 
     def coordinates(self, q: Position) -> Coordinates:
         """
-        :return: the position of each joint, as effects and reports use it; override it for
-            quaternions
+        :return: the position of each joint, for effects and reports; override for quaternions
         """
         return q
 
     def difference(self, state: State, reference: State) -> Tangent:
         """
-        :return: tangent vector from ``reference`` to ``state``: of positions and of velocities one
-            number for each joint, then the memory; override it for quaternions
+        :return: tangent vector from ``reference`` to ``state``: one number per joint for positions,
+            likewise for velocities, then the memory; override for quaternions
         """
         return ravel_pytree(state)[0] - ravel_pytree(reference)[0]
 
@@ -252,7 +251,7 @@ class Twin(abc.ABC):
         return unravel(flat + tangent)
 
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
-        """A line drawing for rendering [m]: by default a bar as high as each joint's position."""
+        """A line drawing for rendering [m]; by default a bar per joint, as high as its position."""
         base = jnp.arange(state.q.shape[0], dtype=state.q.dtype)
         zero = jnp.zeros_like(base)
         return jnp.stack(
@@ -283,7 +282,7 @@ class Twin(abc.ABC):
         return f"{type(self).__name__}({values})"
 
     def _check_declared(self) -> None:
-        """Check the declarations that values depend on."""
+        """Check the declarations that parameter values depend on."""
         kind = type(self).__name__
         if not isinstance(getattr(self, "name", None), str):
             raise TwinError(f"{kind} has no name. Write it into the class: name = 'MyTwin'.")
@@ -322,9 +321,8 @@ class Twin(abc.ABC):
 
 class Layer(Twin):
     """
-    Abstract: a twin around another one. Positions, rewards and the end of an episode are those of
-    the inner twin, with the state and the parameters that :meth:`inner_state` and
-    :meth:`inner_params` translate.
+    Abstract: a twin around another one. By default it forwards to the inner twin, with the state
+    and the parameters that :meth:`inner_state` and :meth:`inner_params` return.
     """
 
     base: Twin

@@ -63,7 +63,7 @@ class MotorLag(ActionEffect):
     parameters = {"time_constant": Parameter(null=0.0, scale=0.02, unit="s", lower=0.0, upper=2.0)}
     explanation = "The drive takes time to follow its command, as a motor with inductance does."
     source = "Åström and Murray 2021, section 3"
-    chained = "time_constant"
+    interpolated = "time_constant"
     equivalents = {"action_delay": "where commands change slowly compared with either"}
 
     def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
@@ -105,7 +105,7 @@ class ActionDelay(Delayed, ActionEffect):
     name = "action_delay"
     explanation = "Commands reach the drive late, as over a bus or a radio link."
     source = "Åström and Murray 2021, section 10"
-    chained = "delay"
+    interpolated = "delay"
     equivalents = {
         "motor_lag": "where commands change slowly compared with either",
         "sensor_delay": "where every channel is as late and nothing is fed back",
@@ -193,7 +193,7 @@ class DeadZone(ActionEffect):
     parameters = {"width": Parameter(null=0.0, scale=0.1, unit="command unit", lower=0.0)}
     explanation = "Small commands do not move the drive, and larger ones lose as much."
     source = "Slotine and Li 1991, section 5.2"
-    chained = "width"
+    interpolated = "width"
     equivalents = {"coulomb_friction": "while the joint moves the way it is driven"}
 
     def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
@@ -228,7 +228,7 @@ class Saturation(ActionEffect):
         "The drive does not reach the largest commands, because of its current or voltage."
     )
     source = "Slotine and Li 1991, section 5.2"
-    chained = "limit"
+    interpolated = "limit"
 
     def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
         return tuple({"limit": share * ranges.largest} for share in _LIMITS if ranges.largest)

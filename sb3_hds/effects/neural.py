@@ -135,7 +135,9 @@ class NeuralForce(ForceEffect):
         std = jnp.std(self.forces(q, v, actuator, own), 0)
         return jnp.max(std / own["output_scale"])
 
-    def doubt(self, twin: "Twin", state: Any, action: Action, base: Params, own: Params) -> Scalar:
+    def uncertainty_penalty(
+        self, twin: "Twin", state: Any, action: Action, base: Params, own: Params
+    ) -> Scalar:
         if not self.caution:
             return jnp.zeros(())
         actuator = twin.actuate(state, action, base)  # type: ignore[attr-defined]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from sb3_hds.core import AnalyticTwin, Params, State, Twin
-from sb3_hds.core.contract import check_methods, check_now
+from sb3_hds.core.contract import check_layer, check_methods
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.errors import TwinError
@@ -199,7 +199,7 @@ def _contract(twin: Twin) -> CheckItem:
     try:
         check_methods(twin)
         for layer in reversed(list(layers_of(twin))):
-            check_now(layer)
+            check_layer(layer)
     except TwinError as error:
         return failed(str(error))
     return passed("what every method returns, in single and double precision")

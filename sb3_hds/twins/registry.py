@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sb3_hds.core import Effect, Twin, seen_through
-from sb3_hds.core.belief import belief_over
+from sb3_hds.core.belief import belief_from_spec
 from sb3_hds.core.contract import check_methods, missing_methods
 from sb3_hds.errors import NoTwinError, TwinError, did_you_mean
 
@@ -140,7 +140,7 @@ def from_spec(spec: Mapping[str, Any], effects: Iterable[type[Effect]] = ()) -> 
         for part in spec.get("effects", ())
     ]
     twin = twin.extend(*attached) if attached else twin
-    twin = belief_over(twin, spec["belief"]) if "belief" in spec else twin
+    twin = belief_from_spec(twin, spec["belief"]) if "belief" in spec else twin
     return seen_through(twin, spec.get("transforms", ()))
 
 

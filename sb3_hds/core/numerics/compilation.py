@@ -20,47 +20,47 @@ import jax
 from sb3_hds.core.trajectories.storage import write_bytes
 
 #: For programs of many small operations: XLA's newer code generator takes a third longer to compile
-#: them and they run no faster. (Matrix products do.)
+#: them, and they run no faster. (Matrix products do.)
 QUICK_COMPILATION = {"xla_cpu_use_fusion_emitters": False}
 
-#: For programs that run a few hundred times at most: a sixth to a half off the time to compile, and
-#: more to run, the more the larger the program.
+#: For programs that run a few hundred times at most: they compile in a half to five sixths of the
+#: time, and run more slowly, large ones most.
 QUICKEST_COMPILATION = QUICK_COMPILATION | {
     "xla_backend_optimization_level": 1,
     "xla_llvm_disable_expensive_passes": True,
 }
 
-#: the random generator that XLA compiles fastest
+#: the random number generator that XLA compiles fastest
 GENERATOR = "unsafe_rbg"
 
 _SWITCH = "SB3_HDS_CACHE"
-# What all files together may take [bytes]; the ones that were not used for longest go.
-_MOST = 256 * 2**20
-# Of this many bytes written, how many files there are is looked up anew.
-_OFTEN = _MOST // 32
-_DIGEST = 16
-# A file that is still being written after this long never will be [s].
+# Total size of all files [bytes]; the least recently used ones are deleted.
+_MAX_SIZE = 256 * 2**20
+# Check the total size each time that this many bytes have been written.
+_CHECK_EVERY = _MAX_SIZE // 32
+_DIGEST_SIZE = 16  # [bytes]
+# Delete temporary files of this age: the process that wrote them was interrupted [s].
 _ABANDONED = 3600.0
 _SUFFIX, _UNFINISHED = ".xla", ".tmp"
-# JAX keeps what took a second to compile. Most programs of a start take less, and there are many.
+# JAX keeps programs that took a second to compile; most of those at start-up take less.
 _DIR, _SECONDS, _USUAL_SECONDS = (
     "jax_compilation_cache_dir",
     "jax_persistent_cache_min_compile_time_secs",
     1.0,
 )
-# Those that JAX was given here.
+# Folders that were set here, not by the user.
 _folders: set[str] = set()
 
 
 def keep_programs() -> Path | None:
     """
-    From now on, keep what JAX compiles in ``~/.cache/sb3_hds/xla``, and take it from there.
+    Cache what JAX compiles in ``~/.cache/sb3_hds/xla`` from now on.
 
     The environment variable ``SB3_HDS_CACHE`` names another folder; empty, it switches this off.
-    Where JAX was given a folder (``JAX_COMPILATION_CACHE_DIR``, ``jax_compilation_cache_dir``) or
-    told to keep nothing (``jax_enable_compilation_cache``), that stands.
+    A folder set in JAX (``JAX_COMPILATION_CACHE_DIR``, ``jax_compilation_cache_dir``) takes
+    precedence, and so does ``jax_enable_compilation_cache=False``.
 
-    :return: the folder; None where nothing is kept by us
+    :return: the folder; None if this cache is not used
     """
     given = os.environ.get(_SWITCH)
     held = jax.config.values.get(_DIR)
@@ -73,7 +73,7 @@ def keep_programs() -> Path | None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError:
         return None
-    if not (os.access(folder, os.R_OK | os.W_OK) and _offered()):
+    if not (os.access(folder, os.R_OK | os.W_OK) and _hook_into_jax()):
         return None
     _folders.add(str(folder))
     jax.config.update(_DIR, str(folder))
@@ -83,11 +83,11 @@ def keep_programs() -> Path | None:
 
 
 @functools.cache
-def _offered() -> bool:
+def _hook_into_jax() -> bool:
     """
-    Have JAX ask for programs here, for folders of ours. It is private to JAX how it opens one.
+    Make JAX use :class:`Programs` for our folders. How it opens one is private to JAX.
 
-    :return: False where JAX does that otherwise by now: then nothing is kept
+    :return: False if this version of JAX opens folders in another way: then nothing is cached
     """
     try:
         from jax._src import compilation_cache
@@ -105,26 +105,25 @@ def _offered() -> bool:
 
 class Programs:
     """
-    Programs by their keys, each in a file that is whole or not there. Any number of processes may
-    read and write them at a time. What takes no part in a program's key but in its code, the
-    instructions that the processor has, is part of its file's name.
+    Compiled programs by key, one file each. Several processes may read and write at the same time.
+    JAX's keys leave out the instruction set of the processor, so it is part of the file names.
 
-    :param folder: where they are
-    :param most: what all of them may take [bytes]
+    :param folder: of the files
+    :param max_size: of all files together [bytes]
     """
 
-    def __init__(self, folder: Path, most: int = _MOST) -> None:
+    def __init__(self, folder: Path, max_size: int = _MAX_SIZE) -> None:
         self._path = folder
-        self._most = most
-        self._unseen = _OFTEN
+        self._max_size = max_size
+        self._unchecked = _CHECK_EVERY
 
     def get(self, key: str) -> bytes | None:
-        """:return: what was put there; None where there is nothing, or it is damaged"""
+        """:return: the program; None if there is none, or its file is damaged"""
         path = self._file(key)
         with contextlib.suppress(OSError):
             stored = path.read_bytes()
-            program = stored[_DIGEST:]
-            if stored[:_DIGEST] == _digest(program):
+            program = stored[_DIGEST_SIZE:]
+            if stored[:_DIGEST_SIZE] == _digest(program):
                 with contextlib.suppress(OSError):
                     os.utime(path)
                 return program
@@ -132,42 +131,42 @@ class Programs:
         return None
 
     def put(self, key: str, program: bytes) -> None:
-        """Write a program, in place of one that is there; where that fails, it is not kept."""
+        """Write a program, or replace it; errors of the file system are ignored."""
         with contextlib.suppress(OSError):
             write_bytes(self._file(key), _digest(program) + program)
-            self._unseen += len(program)
-            if self._unseen >= _OFTEN:
-                self._unseen = 0
-                self._make_room()
+            self._unchecked += len(program)
+            if self._unchecked >= _CHECK_EVERY:
+                self._unchecked = 0
+                self._delete_old_files()
 
     def _file(self, key: str) -> Path:
         return self._path / f"{key}-{_processor()}{_SUFFIX}"
 
-    def _make_room(self) -> None:
+    def _delete_old_files(self) -> None:
         found, abandoned = [], time.time() - _ABANDONED
         with os.scandir(self._path) as entries:
             for entry in entries:
                 with contextlib.suppress(OSError):
-                    seen = entry.stat()
+                    stat = entry.stat()
                     if entry.name.endswith(_SUFFIX):
-                        found.append((seen.st_mtime, seen.st_size, entry.path))
-                    elif entry.name.endswith(_UNFINISHED) and seen.st_mtime < abandoned:
+                        found.append((stat.st_mtime, stat.st_size, entry.path))
+                    elif entry.name.endswith(_UNFINISHED) and stat.st_mtime < abandoned:
                         os.unlink(entry.path)
         total = 0
         for _, size, path in sorted(found, reverse=True):
             total += size
-            if total > self._most:
+            if total > self._max_size:
                 with contextlib.suppress(OSError):
                     os.unlink(path)
 
 
 def _digest(program: bytes) -> bytes:
-    return hashlib.blake2b(program, digest_size=_DIGEST).digest()
+    return hashlib.blake2b(program, digest_size=_DIGEST_SIZE).digest()
 
 
 @functools.cache
 def _processor() -> str:
-    """:return: the same on machines whose processors have the same instructions"""
+    """:return: a hash of the processor's instruction set"""
     try:
         with open("/proc/cpuinfo", "rb") as file:
             lines = file.read(16_384).splitlines()

@@ -1,7 +1,7 @@
 """
 Measured data: the type, its files, and where it comes from.
 
-Names are imported on first use: a loop on a robot needs few of them, and neither JAX nor PyTorch.
+Names are imported on first use, so that a control loop on a robot needs neither JAX nor PyTorch.
 """
 
 from sb3_hds.lazy import lazy_imports

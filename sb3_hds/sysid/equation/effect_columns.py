@@ -209,9 +209,9 @@ def add_command(
     ranges = ranges_of(made, rows, None, i)
     settings, names = effect.grid(ranges), tuple(effect.parameters)
     nulls = {name: p.null for name, p in effect.parameters.items()}
-    if effect.chained and len(settings) < 2:
+    if effect.interpolated and len(settings) < 2:
         return
-    if not effect.chained:
+    if not effect.interpolated:
         steps = [STEP * effect.parameters[name].scale for name in names]
         given = [{**nulls, name: nulls[name] + s} for name, s in zip(names, steps, strict=True)]
     else:
@@ -220,7 +220,7 @@ def add_command(
     before = forces(twin, twin.params, rows.q, rows.v, rows.actions[None])[0]
     after = forces(twin, twin.params, rows.q, rows.v, commands)
     changes = after - before
-    if not effect.chained:
+    if not effect.interpolated:
         columns, useful = [], []
         for name, step, change in zip(names, steps, changes, strict=True):
             if np.abs(change).max() > 0.0:
@@ -241,7 +241,7 @@ def add_command(
                 (1.0, None),
                 "chain",
                 (settings[k], settings[k + 1]),
-                (effect.chained, effect.chained),
+                (effect.interpolated, effect.interpolated),
             )
         )
 
