@@ -37,7 +37,7 @@ def log_reader() -> LogReader | None:
 
 
 def check_target(path: str | os.PathLike[str]) -> None:
-    """:raises OSError: if there is no folder to write that file in, or a folder of its name"""
+    """:raises OSError: if the folder of that file does not exist, or it is a folder itself"""
     target = Path(path)
     if not target.parent.is_dir():
         raise FileNotFoundError(
@@ -97,7 +97,7 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """
     :param path: as given to :func:`write_npz`
     :return: all arrays, by name
-    :raises TrajectoryError: if there is no such file, or if it is damaged or of another kind
+    :raises TrajectoryError: if the file is missing, damaged or of another kind
     """
     source = Path(path)
     if not source.exists() and source.with_name(source.name + _SUFFIX).exists():
@@ -122,8 +122,8 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     ) as error:
         if "allow_pickle" in str(error) and zipfile.is_zipfile(source):
             raise TrajectoryError(
-                f"'{source}' was not written by Trajectories.save: it holds Python objects, which "
-                "would have to be unpickled, and no file is. Save arrays of numbers."
+                f"'{source}' was not written by Trajectories.save: it holds pickled Python "
+                "objects, which are never loaded. Save arrays of numbers."
             ) from error
         message = " ".join(str(error).split())[:200]
         reason = "it holds no arrays of numbers" if "pickle" in message else message
@@ -136,8 +136,8 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 def read_marked(path: str | os.PathLike[str], kind: str, version: int) -> dict[str, np.ndarray]:
     """
     :param path: as given to :func:`write_npz`
-    :param kind: that the file must carry as ``format``
-    :param version: the latest that can be read
+    :param kind: value that ``format`` must have in the file
+    :param version: the latest version that can be read
     :return: all arrays, by name
     :raises TrajectoryError: as :func:`read_npz`, and for another format or a later version
     """

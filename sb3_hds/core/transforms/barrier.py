@@ -1,4 +1,4 @@
-"""A control barrier function for joint limits, for joints that are commanded by their speed."""
+"""A control barrier function for the limits of velocity-controlled joints."""
 
 import dataclasses
 import math
@@ -12,8 +12,8 @@ from sb3_hds.core.declarations import Channel
 from sb3_hds.core.transforms.base import (
     InnerAction,
     InnerObs,
+    MemoryVector,
     OuterAction,
-    Recalled,
     Signals,
     StatefulTransform,
     like,
@@ -25,14 +25,14 @@ from sb3_hds.errors import ParameterError
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Barrier(StatefulTransform):
     r"""
-    A joint that is commanded by its speed approaches a limit no faster than
+    A velocity-controlled joint approaches a limit no faster than
 
     .. math:: u \le \frac{\gamma\,(q_\text{max} - q) - \varepsilon}{\Delta t}
 
     and likewise for the lower limit. With :math:`q_{k+1} = q_k + u\,\Delta t + e`,
-    :math:`|e| \le \varepsilon`, a joint that starts within its limits stays there: the closed form
-    of the discrete-time control barrier function :math:`h = q_\text{max} - q`, :math:`h_{k+1} \ge
-    (1 - \gamma) h_k`. It is no protection for a joint that is commanded by its torque: that one
+    :math:`|e| \le \varepsilon`, a joint that starts within its limits stays there: this is the
+    closed form of the discrete-time control barrier function :math:`h = q_\text{max} - q`,
+    :math:`h_{k+1} \ge (1 - \gamma) h_k`. It does not protect torque-controlled joints, which
     cannot stop at once.
 
     Source: Agrawal and Sreenath, *Discrete control barrier functions for safety-critical control of
@@ -40,14 +40,15 @@ class Barrier(StatefulTransform):
 
     :param low: lower limits :math:`q_\text{min}` [rad] or [m], one per guarded joint
     :param high: upper limits :math:`q_\text{max}`
-    :param position: where the observation has each joint's position: an index, or for an angle the
-        two indices of its cosine and its sine
-    :param action: which command is each joint's speed
+    :param position: where each joint's position is in the observation: its index or, for an angle,
+        the indices of its cosine and its sine
+    :param action: index of each joint's command
     :param gain: speed per unit of the command [rad/s] or [m/s]
     :param share: :math:`\gamma`, above 0 and at most 1
-    :param tolerance: :math:`\varepsilon`, by how much a step may miss [rad] or [m]
+    :param tolerance: :math:`\varepsilon`, largest error of a step [rad] or [m]
     :param dt: control interval :math:`\Delta t` [s]
-    :raises ParameterError: if a number is out of its range, or the limits are too narrow to keep
+    :raises ParameterError: if a number is out of its range, or limits are closer than the tolerance
+        allows
     """
 
     name: ClassVar[str] = "barrier"
@@ -100,16 +101,16 @@ class Barrier(StatefulTransform):
             )
         return ()
 
-    def start(self, obs: InnerObs, below: Signals) -> Recalled:
+    def start(self, obs: InnerObs, below: Signals) -> MemoryVector:
         return obs[:0]
 
     def act(
-        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
-    ) -> tuple[InnerAction, Recalled]:
+        self, action: OuterAction, obs: InnerObs, memory: MemoryVector, below: Signals
+    ) -> tuple[InnerAction, MemoryVector]:
         q, step = self.positions(obs), self.gain * self.dt
         slowest = (self.share * (like(q, self.low) - q) + self.tolerance) / step
         fastest = (self.share * (like(q, self.high) - q) - self.tolerance) / step
-        # Which joint is behind each command; the last entry stands for none.
+        # The guarded joint of each command; the last entry stands for none.
         joints = [self.action.index(i) if i in self.action else -1 for i in range(len(action))]
         free = like(q, [math.inf])
         concatenate, order = namespace(q).concatenate, np.array(joints)
@@ -125,7 +126,7 @@ class Barrier(StatefulTransform):
         return xp.where(first == last, obs[first], xp.arctan2(obs[last], obs[first]))
 
     def violation(self, obs: InnerObs) -> Any:
-        """:return: by how much the guarded joints are beyond their limits, summed"""
+        """:return: the sum over the guarded joints of how far they are beyond their limits"""
         q = self.positions(obs)
         beyond = (like(q, self.low) - q).clip(0.0) + (q - like(q, self.high)).clip(0.0)
         return beyond.sum()

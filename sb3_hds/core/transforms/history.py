@@ -3,14 +3,12 @@
 import dataclasses
 from typing import ClassVar
 
-import numpy as np
-
 from sb3_hds.core.declarations import Actuator, Channel
 from sb3_hds.core.transforms.base import (
     InnerAction,
     InnerObs,
+    MemoryVector,
     OuterAction,
-    Recalled,
     Signals,
     StatefulTransform,
     namespace,
@@ -22,8 +20,8 @@ class History(StatefulTransform):
     """
     Appends the last observations and actions, the latest first; zeros before an episode.
 
-    :param n_observations: observations before the present one
-    :param n_actions: actions before the one that is to be chosen
+    :param n_observations: number of earlier observations
+    :param n_actions: number of earlier actions
     :raises ParameterError: unless both are whole numbers of at least 0, and one is positive
     """
 
@@ -46,12 +44,12 @@ class History(StatefulTransform):
             below.actuators, self.n_actions
         )
 
-    def start(self, obs: InnerObs, below: Signals) -> Recalled:
+    def start(self, obs: InnerObs, below: Signals) -> MemoryVector:
         return namespace(obs).zeros(len(self.remembers(below)), dtype=obs.dtype)
 
     def act(
-        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
-    ) -> tuple[InnerAction, Recalled]:
+        self, action: OuterAction, obs: InnerObs, memory: MemoryVector, below: Signals
+    ) -> tuple[InnerAction, MemoryVector]:
         n_seen, n_done = self.n_observations * obs.shape[0], self.n_actions * action.shape[0]
         concatenate = namespace(action).concatenate
         seen = concatenate([obs, memory[:n_seen]])[:n_seen]
@@ -60,12 +58,9 @@ class History(StatefulTransform):
 
 
 def _earlier(signals: tuple[Channel, ...] | tuple[Actuator, ...], n: int) -> tuple[Channel, ...]:
-    """Channels for what signals were; zeros must fit, too."""
-    low, high = (np.array([getattr(s, end) for s in signals]) for end in ("low", "high"))
-    ends = zip(np.minimum(low, 0.0).tolist(), np.maximum(high, 0.0).tolist(), strict=True)
-    bounds = list(ends)
+    """Channels for the last ``n`` values of signals; their limits include the initial zeros."""
     return tuple(
-        Channel(f"{s.name} {i} ago", s.unit, *bound)
+        Channel(f"{s.name} {i} ago", s.unit, float(min(s.low, 0.0)), float(max(s.high, 0.0)))
         for i in range(1, n + 1)
-        for s, bound in zip(signals, bounds, strict=True)
+        for s in signals
     )

@@ -1,12 +1,12 @@
 r"""
-Oscillators that make gaits, in closed form.
+Oscillators for gaits, in closed form.
 
-A phase moves fast in one half of its cycle and slowly in the other:
+A phase has different frequencies in the two halves of its cycle:
 
 .. math:: \dot\theta = \omega_{swing} \text{ if } \sin\theta > 0 \text{ else } \omega_{stance}
 
-Derivatives exist with respect to everything. Those of a phase jump where it changes over between
-swing and stance, and are right on both sides.
+All functions are differentiable with respect to all arguments. Derivatives of a phase jump at the
+transitions between swing and stance, and are correct on both sides.
 """
 
 import math
@@ -23,16 +23,16 @@ PerJoint = Float[Array, " act"]
 class Gait(NamedTuple):
     r"""
     One oscillator per joint, :math:`q_i(t) = a_i \sin(\theta_i(t) + \varphi_i) + b_i` with
-    :math:`\theta_i(0) = 0`, whose phase :math:`\theta_i + \varphi_i` swings and stands.
+    :math:`\theta_i(0) = 0`; swing and stance depend on :math:`\theta_i + \varphi_i`.
 
     Source: Raffin et al., *An Open-Loop Baseline for Reinforcement Learning Locomotion Tasks*,
     RLJ 2024, equation 1.
 
-    :param amplitude: :math:`a`, in the unit of the joint: rad, m
-    :param offset: :math:`b`, likewise
+    :param amplitude: :math:`a` [rad] or [m]
+    :param offset: :math:`b` [rad] or [m]
     :param phase: :math:`\varphi` [rad]
-    :param omega_swing: while the sine is positive [rad/s], above 0
-    :param omega_stance: while it is not [rad/s], above 0
+    :param omega_swing: frequency while the sine is positive [rad/s], above 0
+    :param omega_stance: frequency while it is not [rad/s], above 0
     """
 
     amplitude: PerJoint
@@ -43,7 +43,7 @@ class Gait(NamedTuple):
 
 
 def period(omega_swing: Any, omega_stance: Any) -> Any:
-    """:return: of one cycle [s]"""
+    """:return: duration of one cycle [s]"""
     return math.pi / omega_swing + math.pi / omega_stance
 
 
@@ -54,29 +54,27 @@ def advance_phase(
     omega_stance: Float[Any, "*#shape"] | float,
 ) -> Float[Any, "*shape"]:
     """
-    Takes arrays of NumPy and JAX alike.
-
-    Where a phase is after some time, exactly: the cycle is two straight lines in time, so nothing
-    is integrated. An Euler step of length h is late by up to ``h`` at each change-over, and the
-    delays add up: ``h (omega_swing - omega_stance)`` rad per change-over at most.
+    The exact phase after some time: it is piecewise linear, so nothing is integrated. Euler steps
+    of length h are late by up to ``h`` at each transition, and these errors accumulate: at most
+    ``h (omega_swing - omega_stance)`` rad per transition. Takes arrays of NumPy and JAX alike.
 
     :param phase: any angle [rad]
     :param duration: 0 or more [s]
     :param omega_swing: [rad/s]
     :param omega_stance: [rad/s]
-    :return: within one turn, from 0 to 2 pi [rad]
+    :return: the phase, from 0 to 2 pi [rad]
     """
     xp = phase.__array_namespace__()
     angle = xp.remainder(phase, 2.0 * math.pi)
     swing = math.pi / omega_swing
-    gone = xp.where(angle < math.pi, angle / omega_swing, swing + (angle - math.pi) / omega_stance)
-    gone = xp.remainder(gone + duration, period(omega_swing, omega_stance))
-    in_swing, in_stance = gone * omega_swing, math.pi + (gone - swing) * omega_stance
-    return xp.where(gone < swing, in_swing, in_stance)
+    time = xp.where(angle < math.pi, angle / omega_swing, swing + (angle - math.pi) / omega_stance)
+    time = xp.remainder(time + duration, period(omega_swing, omega_stance))
+    in_swing, in_stance = time * omega_swing, math.pi + (time - swing) * omega_stance
+    return xp.where(time < swing, in_swing, in_stance)
 
 
 def target_at(gait: Gait, time: Scalar | float) -> PerJoint:
-    """:return: the wanted position of each joint ``time`` seconds after the start"""
+    """:return: the target position of each joint ``time`` seconds after the start"""
     phase = advance_phase(gait.phase, time, gait.omega_swing, gait.omega_stance)
     return gait.amplitude * jnp.sin(phase) + gait.offset
 
