@@ -122,8 +122,8 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     ) as error:
         if "allow_pickle" in str(error) and zipfile.is_zipfile(source):
             raise TrajectoryError(
-                f"'{source}' was not written by Trajectories.save: it holds pickled Python "
-                "objects, which are never loaded. Save arrays of numbers."
+                f"'{source}' was not written by Trajectories.save: it holds Python objects, which "
+                "would have to be unpickled, and no file is. Save arrays of numbers."
             ) from error
         message = " ".join(str(error).split())[:200]
         reason = "it holds no arrays of numbers" if "pickle" in message else message
