@@ -230,7 +230,7 @@ def seen_through(
     for layer in layers:
         parts = [transform_from_spec(part, known) for part in layer]
         placed: Any = {
-            n: part for n, kind in kinds.items() for part in parts if isinstance(part, kind)
+            name: p for p in parts for name, kind in _KINDS.items() if isinstance(p, kind)
         }
         base = TransformedTwin(base, **placed)
     return base

@@ -29,8 +29,7 @@ from sb3_hds.effects.sensor import SensorBias, SensorDelay, SensorScale, SignFli
 from sb3_hds.effects.transmission import Backlash, JointElasticity
 from sb3_hds.errors import EffectError, did_you_mean
 
-# In the order in which a signal meets them: a bus, then the drive, then its motor; a sensor, then
-# its bus.
+# In the order of the signal path: a bus, the drive, its motor; a sensor, its bus.
 ALL: tuple[type[Effect], ...] = (
     ViscousFriction,
     DirectionalViscousFriction,
@@ -58,12 +57,11 @@ ALL: tuple[type[Effect], ...] = (
     SensorDelay,
 )
 
-#: What exists and no catalogue of names can be complete of: never the name of a cause, but what
-#: causes at joints are measured against.
+#: flexible forces, which stand for effects outside the catalogue: a diagnosis never names them as a
+#: cause, but a cause at a joint must predict better than they do
 NAMELESS: tuple[type[Effect], ...] = (ClearanceSpring, Hysteresis)
 
-#: Everything that a saved twin may have attached: the catalogue, and what is never the name of a
-#: cause, a learned residual among it.
+#: everything that a saved twin may have attached: also flexible forces and learned residuals
 KNOWN: tuple[type[Effect], ...] = (*ALL, *NAMELESS, NeuralForce)
 
 __all__ = [
