@@ -1,4 +1,4 @@
-"""The library of twins, one file per system, and their registry."""
+"""The library of twins, one file per system, and its registry."""
 
 from sb3_hds.core import Twin
 from sb3_hds.twins.check import check

@@ -16,8 +16,8 @@ _DRIVEN = {"both": (_SHOULDER, _ELBOW), "first": (_SHOULDER,), "second": (_ELBOW
 
 class DoublePendulum(Rig):
     r"""
-    A double pendulum whose links hang at zero, driven at its first joint (pendubot), its second
-    (acrobot), or both. The second angle counts from the first link.
+    A double pendulum, driven at its first joint (pendubot), its second (acrobot), or both. The
+    links hang at zero, and the second angle is relative to the first link.
 
     .. math::
         M = \begin{pmatrix}
@@ -35,7 +35,7 @@ class DoublePendulum(Rig):
     and Automation Magazine, 2023, equations of motion.
 
     :param driven: option; ``"both"``, ``"first"`` or ``"second"``
-    :param tip: option; how far from the second joint a payload hangs [m]
+    :param tip: option; distance of the payload from the second joint [m]
     """
 
     name = "DoublePendulum"
@@ -78,8 +78,7 @@ class DoublePendulum(Rig):
         if self.driven == "both":
             return action
         zero = jnp.zeros_like(action[0])
-        pair = (action[0], zero) if self.driven == "first" else (zero, action[0])
-        return jnp.stack(pair)
+        return jnp.stack((action[0], zero) if self.driven == "first" else (zero, action[0]))
 
     def mass_matrix(self, q: Position, params: Params) -> MassMatrix:
         mass, moment = self._second_link(params)
@@ -98,15 +97,9 @@ class DoublePendulum(Rig):
         inner = jnp.sin(angle)
         upper = params["mass1"] * params["com1"] + mass * params["length1"]
         outer = g * moment * jnp.sin(angle + q[1])
-        return jnp.stack(
-            [
-                -bend * (2.0 * v[0] + v[1]) * v[1]
-                + g * upper * inner
-                + outer
-                + params["damping1"] * v[0],
-                bend * v[0] ** 2 + outer + params["damping2"] * v[1],
-            ]
-        )
+        first = -bend * (2.0 * v[0] + v[1]) * v[1] + g * upper * inner + outer
+        second = bend * v[0] ** 2 + outer
+        return jnp.stack([first + params["damping1"] * v[0], second + params["damping2"] * v[1]])
 
     def _second_link(self, params: Params) -> tuple[Any, Any]:
         """Mass [kg] and first moment about the second joint [kg m], payload included."""

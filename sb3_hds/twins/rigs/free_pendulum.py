@@ -1,4 +1,4 @@
-"""A pendulum that swings by itself."""
+"""A pendulum that swings freely."""
 
 import math
 
@@ -23,13 +23,13 @@ class FreePendulum(Rig):
 
     with the distance :math:`a` from the pivot to the centre of mass, the moment of inertia
     :math:`I` about that, and a payload :math:`m_p` at a distance :math:`l` from the pivot.
-    :math:`\theta_0` is 0 where the angle counts from hanging, and :math:`\pi` where it counts from
-    upright; by :math:`\gamma`, gravity is tilted, as on a table that is not level. Without a motor,
-    only their quotients show in the motion.
+    :math:`\theta_0` is 0 if the angle is zero when hanging, and :math:`\pi` if it is zero upright.
+    Gravity is tilted by :math:`\gamma`, as on a table that is not level. Without a motor, the
+    motion determines only ratios of the parameters.
 
-    :param zero: option; ``"down"`` or ``"up"``: where the angle is zero
+    :param zero: option; ``"down"`` or ``"up"``: the position at which the angle is zero
     :param driven: option; whether a motor at the pivot takes a torque
-    :param tip: option; how far from the pivot a payload hangs [m]
+    :param tip: option; distance of the payload from the pivot [m]
     """
 
     name = "FreePendulum"

@@ -1,4 +1,4 @@
-"""Machines on a bench: measured joint by joint, without a task."""
+"""Machines on a test bench: joints are measured directly, and there is no task."""
 
 import math
 from typing import Any
@@ -10,27 +10,27 @@ from jaxtyping import PRNGKeyArray
 from sb3_hds.core import AnalyticTwin, Channel, Obs, Parameter, Params, State, rk4
 from sb3_hds.errors import ParameterError
 
-#: by how much gravity is turned in the plane of a pendulum, the way the angle counts
+#: rotation of gravity in the plane of a pendulum, in the direction of its angle
 TILT = Parameter(null=0.0, scale=0.02, unit="rad", lower=-0.5 * math.pi, upper=0.5 * math.pi)
 
 
 class Rig(AnalyticTwin):
     """
-    A machine whose joints are measured directly, and that nobody gives a reward.
+    Abstract: a machine whose joints are measured directly, without a reward.
 
-    Runge-Kutta steps follow continuous time. Recordings begin anywhere, so :meth:`initial` only
-    serves to try the rig out: at rest, within 0.1 [rad or m] of where positions are zero. Where
-    velocities are not observed, :meth:`infer` says zero.
+    Runge-Kutta steps approximate continuous time. Recordings begin anywhere, so :meth:`initial` is
+    only for trials: at rest, within 0.1 rad or m of zero. If velocities are not observed,
+    :meth:`infer` sets them to zero.
 
-    :param observe: ``"q"`` if encoders report positions only, ``"qv"`` for velocities too
-    :param settings: as of every twin
+    :param observe: ``"q"`` for positions only, as of encoders, ``"qv"`` for velocities too
+    :param settings: as for every twin
     :raises ParameterError: for another ``observe``
     """
 
     dt = 0.01
     substeps = 2
     integrator = staticmethod(rk4)
-    #: what ``observe`` may be
+    #: valid values of ``observe``
     observable: tuple[str, ...] = ("q", "qv")
     observed: str
 
