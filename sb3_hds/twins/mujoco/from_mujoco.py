@@ -35,29 +35,29 @@ def from_mujoco(
     """
     A twin of a model that MuJoCo can load, without contacts.
 
-    Its parameters carry the names and words of the file: ``elbow_damping``, ``elbow_frictionloss``,
+    Parameters have the names of the file: ``elbow_damping``, ``elbow_frictionloss``,
     ``elbow_armature``, ``elbow_servo_kp``.
 
     :param model_or_path_or_env: path or text of an MJCF or URDF file (meshes may be missing where
         inertials are given), an ``MjSpec`` or ``MjModel``, or a MuJoCo environment of Gymnasium
     :param engine: ``"smooth"``, or ``"auto"``, which is the same
-    :param actuators: for a model that names none, or to replace them: ``"torque"`` (the default of
-        a URDF) for a motor at each hinge and slide, within its effort limit; or a mapping such as
-        ``{"kind": "position", "kp": 20.0, "kv": 1.5}``, whose commands are targets. Each value is
-        one number, or a mapping from joints to numbers; ``limit`` is of the force.
+    :param actuators: for a model without actuators, or to replace them: ``"torque"`` (default for a
+        URDF) for a motor at each hinge and slide, within its effort limit; or a mapping such as
+        ``{"kind": "position", "kp": 20.0, "kv": 1.5}``, whose commands are targets. A value is one
+        number, or a mapping from joints to numbers; ``limit`` is that of the force.
     :param dt: control interval [s]; default: the environment's, or the model's time step
     :param integrator: ``"euler"``, ``"implicitfast"`` or ``"rk4"``; default: the model's, or
         ``"implicitfast"`` for a URDF
     :param observe: ``"qv"`` for positions and velocities, ``"q"`` for positions only
-    :param payload: name of a site or body: an unknown mass may be there, or near it
+    :param payload: name of a site or body at which, or near which, an unknown mass may be
     :param masses: whether mass, centre and inertia of each body are parameters, too; a warning
         lists those that no motion can identify
     :param reward: of a task: ``reward(state, action, next_state, params)``
-    :param terminated: when a task ends: ``terminated(state, params)``
-    :param ignore: what the model has and the twin may do without: ``"contacts"`` where nothing
-        touches in the data, ``"equality"``, ``"fluid"``, ``"limits"``, ``"tendons"``
-    :raises ModelFileError: for a file that cannot be read, or a model with more than that
-    :raises ParameterError: for actuators, an integrator or a payload that make no sense
+    :param terminated: termination of a task: ``terminated(state, params)``
+    :param ignore: features of the model that the twin omits: ``"contacts"`` if there are none in
+        the data, ``"equality"``, ``"fluid"``, ``"limits"``, ``"tendons"``
+    :raises ModelFileError: for a file that cannot be read, or unsupported features of the model
+    :raises ParameterError: for invalid actuators, integrator or payload
     """
     if engine not in ("auto", "smooth"):
         raise ParameterError(
@@ -101,7 +101,7 @@ def from_mujoco(
 
 
 def _drives(mechanism: Mechanism, wanted: str | Mapping[str, Any]) -> list[Drive]:
-    """One at each hinge and slide."""
+    """A drive at each hinge and slide."""
     given = {"kind": wanted} if isinstance(wanted, str) else dict(wanted)
     kind = str(given.pop("kind", None))
     gains = {"torque": (), "position": ("kp", "kv"), "velocity": ("kv",)}.get(kind)
@@ -143,7 +143,7 @@ def _drives(mechanism: Mechanism, wanted: str | Mapping[str, Any]) -> list[Drive
 
 
 def _by_joint(name: str, value: Any, joints: Sequence[Link]) -> dict[str, float]:
-    """A number for each joint, from one for all or a mapping."""
+    """One number for each joint, from a mapping or a common value."""
     known = [link.joint for link in joints]
     if not isinstance(value, Mapping):
         value = dict.fromkeys(known, value)

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from sb3_hds.twins.mujoco.twin import MechanismTwin
 
 _N_MOTIONS = 64
-# Of a parameter's scale, along the imaginary axis: the derivative is exact to rounding.
+# Complex step, in scales of a parameter: the derivative is exact to rounding.
 _STEP = 1e-20
-# Shares of the largest singular value, and of a direction, that are rounding.
+# Singular values below this share of the largest, and entries of unit vectors below this, are zero.
 _RANK, _SHARE = 1e-9, 1e-5
 _FEW = 6
 
@@ -23,7 +23,7 @@ _FEW = 6
 def unidentifiable(twin: "MechanismTwin") -> str:
     """
     :return: a sentence on the masses, centres, inertias and armatures that no data can identify, or
-        only in combination; empty if there are none
+        only in combinations; empty if there are none
 
     Source: Khalil and Dombre, *Modeling, Identification and Control of Robots*, Kogan Page 2002,
     section 9.4.
@@ -35,9 +35,9 @@ def unidentifiable(twin: "MechanismTwin") -> str:
         name for name, length in zip(names, size, strict=True) if length < _RANK * size.max()
     ]
     seen = [i for i, name in enumerate(names) if name not in nothing]
-    _, values, ways = np.linalg.svd(slopes[:, seen] / size[seen], full_matrices=True)
+    _, values, directions = np.linalg.svd(slopes[:, seen] / size[seen], full_matrices=True)
     rank = int(np.sum(values > _RANK * values[0]))
-    alone = np.linalg.norm(ways[rank:], axis=0) < _SHARE
+    alone = np.linalg.norm(directions[rank:], axis=0) < _SHARE
     together = [names[i] for i, free in zip(seen, alone, strict=True) if not free]
     parts = []
     if nothing:
@@ -56,7 +56,7 @@ def unidentifiable(twin: "MechanismTwin") -> str:
 
 
 def inertial(twin: "MechanismTwin") -> list[str]:
-    """:return: names of the parameters that shape masses and inertias"""
+    """:return: names of the parameters of masses and inertias"""
     mechanism = twin.mechanism
     bodies = [link.body.name for link in mechanism.links if link.body]
     ends = ["mass", *(f"com_{x}" for x in "xyz"), *(f"stretch_{x}" for x in "xyz")]
@@ -67,7 +67,7 @@ def inertial(twin: "MechanismTwin") -> list[str]:
 
 
 def regressor(twin: "MechanismTwin", names: list[str]) -> Float[np.ndarray, "rows p"]:
-    """:return: slopes of the forces that random motions need, by parameters in their scales"""
+    """:return: derivatives of inverse dynamics of random motions by the scaled parameters"""
     mechanism = twin.mechanism
     tree, rng = Tree(mechanism.links), np.random.default_rng(0)
     q = random_positions(mechanism, _N_MOTIONS)

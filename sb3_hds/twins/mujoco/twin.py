@@ -1,4 +1,4 @@
-"""A twin made of a model file."""
+"""A twin made from a model file."""
 
 import hashlib
 import json
@@ -35,7 +35,7 @@ from sb3_hds.twins.mujoco.rigid_body import algebra as alg
 from sb3_hds.twins.mujoco.rigid_body.dynamics import frames_of
 from sb3_hds.twins.mujoco.rigid_body.quaternions import normalized, turn_between, turned
 
-# How far an episode begins from where the model stands [rad] or [m].
+# Largest distance of initial positions from the model's [rad] or [m].
 _NEAR_START = 0.1
 _UNLIMITED = (-math.inf, math.inf)
 
@@ -51,24 +51,24 @@ class MechanismTwin(AnalyticTwin):
     .. math:: M(q)\,\dot v + c(q, v) + \tau_\text{damping} + \tau_\text{dry} + \tau_\text{spring}
               = \tau(q, v, u)
 
-    Equals MuJoCo's ``Euler``, ``implicitfast`` and ``RK4`` while nothing touches, no joint is at
-    its limit and nothing rubs. Dry friction is :math:`\tau_c \tanh(v / 0.01)`, taken at the end of
-    the step as damping is (by ``RK4`` at its beginning, smoothed over what a step can stop): under
-    a load a joint creeps where MuJoCo's sticks. Orientations are quaternions in positions, and
+    Equals MuJoCo's ``Euler``, ``implicitfast`` and ``RK4`` without contacts, active joint limits
+    and dry friction. Dry friction is :math:`\tau_c \tanh(v / 0.01)`, taken like damping at the end
+    of the step (by ``RK4`` at its beginning, smoothed over the speed that a step can stop): under a
+    load a joint creeps where MuJoCo's sticks. Orientations are quaternions in positions, and
     rotation vectors in tangents; the velocity of a ball or free joint is MuJoCo's: its rotation in
     the body's frame.
 
     Made by ``twins.from_mujoco``.
 
-    :param mechanism: the numbers of the model, or their plain data
-    :param observe: ``"qv"`` for positions and velocities, ``"q"`` for positions only, where
-        :meth:`infer` says that velocities are zero
+    :param mechanism: the data of the model, also as plain data
+    :param observe: ``"qv"`` for positions and velocities, ``"q"`` for positions only: then
+        :meth:`infer` sets velocities to zero
     :param payload: name of the site or body that may carry an unknown mass
     :param masses: whether mass, centre and inertia of each body are parameters
     :param dt: control interval [s]; default: the model's time step
-    :param substeps: default: as many as keep to the model's time step
+    :param substeps: default: the fewest with at most the model's time step
     :param reward: of a task; None: zero
-    :param terminated: when a task ends; None: never
+    :param terminated: termination of a task; None: never
     :param settings: values of parameters
     """
 
@@ -102,7 +102,7 @@ class MechanismTwin(AnalyticTwin):
         self.actuation = Actuation(mechanism)
         self.parameters = self.equation.parameters | of_drives(mechanism)
         self.native_effects = native_effects(mechanism)
-        # The damping gain of a drive is known; viscous friction would be aliased with it.
+        # The damping gain of a drive counts as known, because viscous friction is aliased with it.
         servos = ("position", "velocity")
         self.known_parameters = frozenset(
             f"{drive.name}_kv" for drive in mechanism.drives if drive.role in servos
@@ -140,7 +140,7 @@ class MechanismTwin(AnalyticTwin):
         return self.equation.acceleration(q, v, force, coupling, params, step)
 
     def _coupling(self, state: State, command: Action, params: Params) -> MassMatrix:
-        """The step times slopes by velocities, of what the integrator takes at its end."""
+        """The step times derivatives by velocities, for forces taken at the end of the step."""
         mechanism, h = self.mechanism, self.dt / self.substeps
         implicit = mechanism.integrator == "implicitfast"
         slope = jnp.zeros_like(state.v)
@@ -153,7 +153,7 @@ class MechanismTwin(AnalyticTwin):
 
     @property
     def _explicit_step(self) -> float:
-        """The step [s] where damping is taken at its beginning, 0 where it is at its end."""
+        """The step [s] if damping is taken at its beginning, 0 if at its end."""
         euler = self.mechanism.integrator == "euler" and self.mechanism.implicit_damping
         implicit = euler or self.mechanism.integrator == "implicitfast"
         return 0.0 if implicit else self.dt / self.substeps
@@ -162,31 +162,31 @@ class MechanismTwin(AnalyticTwin):
         return Moving(state.q, self.coordinates(state.q), state.v)
 
     def typical_forces(self) -> tuple[float, ...]:
-        """Gravity's at random positions, and the most that actuators are said to exert."""
+        """Largest gravity at random positions, plus the limits of the actuators."""
         usual = self.equation.typical
         return tuple((usual.weight + usual.drive).tolist())
 
     # --- positions
 
     def coordinates(self, q: Position) -> Coordinates:
-        """Where a joint has a quaternion: the rotation vector from its reference."""
+        """Quaternions become rotation vectors from the reference."""
         return self._between(q, self._reference(q)) if self._curved else q
 
-    def displace(self, q: Position, way: Velocity) -> Position:
+    def displace(self, q: Position, displacement: Velocity) -> Position:
         if not self._curved:
-            return q + way
+            return q + displacement
         parts = []
         for link in self.mechanism.links:
-            here, ahead = q[link.straight], way[link.v : link.v + len(link.dofs)]
+            here, ahead = q[link.straight], displacement[link.v : link.v + len(link.dofs)]
             parts.append(here + ahead[: len(here)])
             if link.quaternion:
                 parts.append(turned(q[link.quaternion], ahead[-3:]))
         return jnp.concatenate(parts)
 
     def difference(self, state: State, reference: State) -> Tangent:
-        rest = ravel_pytree(state.memory)[0] - ravel_pytree(reference.memory)[0]
-        way = self._between(state.q, reference.q)
-        return jnp.concatenate([way, state.v - reference.v, rest])
+        memory = ravel_pytree(state.memory)[0] - ravel_pytree(reference.memory)[0]
+        displacement = self._between(state.q, reference.q)
+        return jnp.concatenate([displacement, state.v - reference.v, memory])
 
     def retract(self, state: State, tangent: Tangent) -> State:
         n = self.mechanism.n_v
@@ -219,10 +219,11 @@ class MechanismTwin(AnalyticTwin):
     # --- measurements
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
-        """At rest near where the model stands: its first keyframe, or its reference position."""
+        """At rest, near the model's first keyframe or its reference position."""
         start, n = jnp.array(self.mechanism.start), self.mechanism.n_v
-        way = jax.random.uniform(key, (n,), minval=-_NEAR_START, maxval=_NEAR_START)
-        return State(self.displace(start, way.astype(start.dtype)), jnp.zeros(n, start.dtype), {})
+        offset = jax.random.uniform(key, (n,), minval=-_NEAR_START, maxval=_NEAR_START)
+        q = self.displace(start, offset.astype(start.dtype))
+        return State(q, jnp.zeros(n, start.dtype), {})
 
     def infer(self, obs: Obs, params: Params) -> State:
         n = self.mechanism.n_q
@@ -249,7 +250,7 @@ class MechanismTwin(AnalyticTwin):
     def skeleton(self, state: State) -> Float[Array, "capsules 2 3"]:
         """
         :return: both ends of a capsule for each link: from its parent's frame to its own, and from
-            the frame of a last link to its centre of mass, or the farthest site or body there [m]
+            the frame of a leaf to the farthest of its centre of mass, sites and bodies [m]
         """
         links, zero = self.mechanism.links, jnp.zeros_like(state.v[0])
         frames = frames_of(links, list(state.q))
@@ -272,8 +273,8 @@ class MechanismTwin(AnalyticTwin):
 
     def meshes(self, state: State) -> Float[Array, "shapes corners 3"]:
         """
-        :return: corners of the convex bodies that its model's meshes are drawn as [m]; those of a
-            body that has fewer than others come more than once
+        :return: corners of the convex hulls of the model's meshes [m]; those of smaller hulls are
+            repeated
         """
         shapes, frames = self.mechanism.shapes, frames_of(self.mechanism.links, list(state.q))
         most = max((len(shape.points) for shape in shapes), default=0)
@@ -288,7 +289,7 @@ class MechanismTwin(AnalyticTwin):
         return jnp.concatenate(found)
 
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
-        """The mechanism seen along y: from the world through all joints to each last body."""
+        """The mechanism seen along y: from the world through all joints to each leaf."""
         links, zero = self.mechanism.links, jnp.zeros_like(state.v[0])
         frames = frames_of(links, list(state.q))
         seen = lambda place: jnp.stack([zero + place[0], zero + place[2]])  # noqa: E731
@@ -309,7 +310,7 @@ class MechanismTwin(AnalyticTwin):
     # --- plain data
 
     def to_spec(self) -> dict[str, Any]:
-        """Without reward and termination, which are programs."""
+        """Without reward and termination, which are functions."""
         options = {
             "mechanism": self.mechanism.to_spec(),
             "observe": self.observed,

@@ -15,20 +15,20 @@ from sb3_hds.twins.mujoco.twin import MechanismTwin
 
 OF_JOINTS = ("damping", "frictionloss", "armature", "stiffness")
 DIGITS = 9
-# Smaller changes of a body, relative to it, are rounding.
+# Relative changes of a body below this are rounding errors.
 _SAME = 1e-12
 
 
 @dataclasses.dataclass
 class Correction:
     """
-    The changes that a file has to carry, and the record of what was written.
+    The differences to write into a model file, and a record of what was written.
 
     :param plant: the twin of the file, without effects
-    :param values: of the plant, with what effects add to them
-    :param effects: others: name, index and place of each, with its values
-    :param changed: what was written, a line each
-    :param left_out: what the format cannot express, a line each
+    :param values: parameters of the plant, changed by native effects
+    :param effects: the other effects: name, index of the place, key and values of each
+    :param changed: written changes, a line each
+    :param left_out: changes that the format cannot express, a line each
     """
 
     plant: MechanismTwin
@@ -63,7 +63,7 @@ class Correction:
         return self.plant.mechanism
 
     def difference(self, name: str) -> float:
-        """:return: from the value that the file has"""
+        """:return: the change of a parameter relative to the file"""
         if name not in self.values:
             return 0.0
         return self.values[name] - self.plant.parameters[name].null

@@ -1,4 +1,4 @@
-"""A corrected twin as MJCF: the source of the model, changed by MuJoCo itself."""
+"""A corrected twin as MJCF: the ``MjSpec`` of the source, with changes."""
 
 import dataclasses
 import math
@@ -24,7 +24,7 @@ from sb3_hds.twins.mujoco.mechanism import Drive, Link, Mechanism
 from sb3_hds.twins.mujoco.parameters import gravity_of
 
 # Share of a joint's motion that its dry friction may stop in a step: MuJoCo's impedance.
-_DAMPED = 0.99
+_IMPEDANCE = 0.99
 
 
 def mjcf_of(correction: Correction, source: Any, target: Path) -> str:
@@ -56,7 +56,7 @@ def mjcf_of(correction: Correction, source: Any, target: Path) -> str:
         actuators = [_added(spec, by_id[d.link], d) for d in mechanism.drives]
         correction.changed += [f"actuator {drive.name}" for drive in mechanism.drives]
     for actuator, drive, before in zip(actuators, drives, mechanism.drives, strict=True):
-        # A damping ratio is of the masses that the file came with; its damping stays what it was.
+        # A damping ratio depends on the masses: write the damping that it meant in the source.
         by_ratio = drive.kind != "dcmotor" and float(actuator.biasprm[2]) > 0.0
         if drive != before or by_ratio:
             _write_gains(actuator, drive)
@@ -86,24 +86,24 @@ def _write_joint(correction: Correction, joint: Any, link: Link, step: float) ->
         change = correction.difference(full)
         if not change:
             continue
-        # What actuators bring along stays theirs.
+        # Damping and armature of actuators, which the twin adds, stay with them.
         now = np.array(getattr(joint, name), float)
         now.reshape(-1)[0] = max(0.0, round(float(now.reshape(-1)[0]) + change, DIGITS))
         setattr(joint, name, now if now.ndim else float(now))
         correction.record_change(full)
     if correction.values.get(f"{link.joint}_frictionloss", link.friction[0]) > 0.0:
-        # By default MuJoCo's dry friction is soft: below some speed, of a light joint a fast one,
-        # it is viscous. The twin's is not, and so this stops what it can stop within a step.
-        share = _DAMPED
-        joint.solimp_friction = np.array([share, share, *np.array(joint.solimp_friction)[2:]])
-        joint.solref_friction = np.array([-1.0, -share / step])
+        # By default MuJoCo's dry friction is viscous below some speed, a high one for light joints.
+        # These settings stop a joint within a step instead, like the twin's friction.
+        impedance = [_IMPEDANCE, _IMPEDANCE, *np.array(joint.solimp_friction)[2:]]
+        joint.solimp_friction = np.array(impedance)
+        joint.solref_friction = np.array([-1.0, -_IMPEDANCE / step])
         correction.changed.append(
             f"dry friction of {link.joint} holds within a step (solreffriction)"
         )
 
 
 def _corrected(correction: Correction, drive: Drive) -> Drive:
-    """With calibrated gains."""
+    """The drive with calibrated gains."""
     own = {
         name: correction.values[f"{drive.name}_{name}"]
         for name in ("gain", "kp", "kv", "motorconst", "resistance")
@@ -173,7 +173,7 @@ def _write_effects(correction: Correction, spec: Any, actuators: list[Any]) -> N
 
 
 def _write_delay(actuator: Any, drive: Drive, own: Mapping[str, float], step: float) -> bool:
-    """MuJoCo keeps samples of commands, one for each step, since 3.5."""
+    """Since 3.5, MuJoCo can delay commands by samples, one for each step."""
     if not hasattr(actuator, "delay"):
         return False
     if own["delay"] > 0.0:
@@ -186,14 +186,14 @@ def _write_lag(actuator: Any, drive: Drive, own: Mapping[str, float], step: floa
     mj = mujoco()
     if own["time_constant"] > 0.0:
         actuator.dyntype = mj.mjtDyn.mjDYN_FILTEREXACT
-        dynamics_of = np.array(actuator.dynprm, float)
-        dynamics_of[0] = round(own["time_constant"], DIGITS)
-        actuator.dynprm = dynamics_of
+        dynamics = np.array(actuator.dynprm, float)
+        dynamics[0] = round(own["time_constant"], DIGITS)
+        actuator.dynprm = dynamics
     return True
 
 
 def _write_limit(actuator: Any, drive: Drive, own: Mapping[str, float], step: float) -> bool:
-    """A limit of zero is none."""
+    """A limit of zero means no limit."""
     limit = own["limit"]
     if limit > 0.0:
         low, high = drive.ranges[0] or (-math.inf, math.inf)
@@ -203,7 +203,7 @@ def _write_limit(actuator: Any, drive: Drive, own: Mapping[str, float], step: fl
 
 
 def _write_gain(actuator: Any, drive: Drive, own: Mapping[str, float], step: float) -> bool:
-    """Of a servo: its target counts for more, or less."""
+    """For a servo: the gain of its target."""
     if drive.kind != "affine":
         return False
     gain = np.array(actuator.gainprm, float)
@@ -221,7 +221,7 @@ _OF_ACTUATORS = {
 
 
 def _write_bodies(correction: Correction, spec: Any, model: Any) -> None:
-    """What is rigidly carried by a joint is one body of the twin: the first of them changes."""
+    """Bodies that are rigidly attached to one joint are one body of the twin: change the first."""
     wanted = changed_bodies(correction)
     if not wanted:
         return
@@ -271,7 +271,7 @@ def _write_inertial(
 
 
 def _keep_assets(spec: Any, source: Path, target: Path) -> None:
-    """Meshes and textures stay where they are."""
+    """Make relative paths of meshes and textures valid in the target's folder."""
     there, here = source.resolve().parent, target.resolve().parent
     if there == here or not (spec.meshes or spec.hfields or spec.textures or spec.skins):
         return

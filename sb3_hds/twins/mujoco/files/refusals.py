@@ -1,4 +1,4 @@
-"""Features of a model that its twin does not simulate, refused with the remedy."""
+"""Errors for features of a model that its twin does not simulate, with the remedy."""
 
 from collections.abc import Collection
 from typing import Any
@@ -9,7 +9,7 @@ from sb3_hds.errors import ModelFileError, first_names
 from sb3_hds.twins.mujoco.files.reading import n_actuators
 from sb3_hds.twins.mujoco.library import mujoco
 
-#: what may be left out of a twin on request
+#: features that a twin may omit on request
 IGNORABLE = ("contacts", "equality", "fluid", "limits", "tendons")
 
 
@@ -62,7 +62,7 @@ def _ignorable(model: Any) -> dict[str, str]:
 
 
 def _never(model: Any, integrator: str) -> list[str]:
-    """What cannot be left out either."""
+    """Messages for features that cannot be omitted."""
     mj = mujoco()
     found = []
     if model.nflex:

@@ -10,7 +10,7 @@ import numpy as np
 from sb3_hds.twins.mujoco.library import mujoco
 from sb3_hds.twins.mujoco.mechanism import Place, Shape
 
-# What MuJoCo reads.
+# Mesh formats that MuJoCo reads.
 _FORMATS = (".obj", ".stl")
 # Directions in which the outermost vertex of a mesh is kept.
 _N_DIRECTIONS = 64
@@ -19,8 +19,8 @@ _N_DIRECTIONS = 64
 def shapes_of(model: Any, places: Sequence[Place]) -> tuple[Shape, ...]:
     """
     :param model: compiled with its meshes
-    :param places: frames of its bodies in those of the links
-    :return: one for each geom that is a mesh, of a body that has a name which no site has
+    :param places: frames of its bodies, relative to the links
+    :return: one for each mesh geom of a body whose name no site has
     """
     frames = {"world": Place("world", -1, (0.0, 0.0, 0.0), tuple(map(tuple, np.eye(3))))}
     sites = {model.site(i).name for i in range(model.nsite)}
@@ -43,12 +43,12 @@ def shapes_of(model: Any, places: Sequence[Place]) -> tuple[Shape, ...]:
 
 def visuals_of(text: str, folder: Path) -> Any:
     """
-    MuJoCo drops what only shows of a URDF, and fails where a file is missing.
+    The visual meshes of a URDF: MuJoCo drops them, and fails if a file is missing.
 
     :param text: of a URDF
-    :param folder: in which it lies
-    :return: a compiled model of loose bodies, named as the links, with the meshes that are there;
-        None where there are none, or they make no sense: a twin can do without
+    :param folder: of its file
+    :return: a compiled model of loose bodies, named as the links, with the existing meshes; None
+        without any, or if they cannot be read
     """
     try:
         return _loose_bodies(ElementTree.fromstring(text), folder)
@@ -91,7 +91,7 @@ def _body_of(spec: Any, name: str) -> Any:
 
 
 def _found(name: str, folder: Path) -> Path | None:
-    """A mesh by the end of its path: the root of its package is unknown."""
+    """Find a mesh by the end of its path, because the root of its package is unknown."""
     parts = Path(name.partition("://")[2] or name).parts
     for first in range(len(parts)):
         path = folder.joinpath(*parts[first:])

@@ -79,7 +79,7 @@ def _write_urdf_joint(correction: Correction, joint: Any, link: Link) -> None:
 
 
 def _write_urdf_inertial(correction: Correction, link: Any, body: Body, new: spatial.Body) -> None:
-    """Only where nothing else is rigidly carried: then the link is the twin's body."""
+    """Only if the link carries no other links rigidly: then it is the body of the twin."""
     own = None if link is None else link.find("inertial")
     mass = None if own is None else own.find("mass")
     held = math.nan if mass is None else float(mass.get("value", "nan"))
