@@ -13,8 +13,8 @@ from typing import Any
 
 class _Package(ModuleType):
     """
-    A public name may be that of a submodule, too (``data.audit``): it stays what it stands for
-    when the submodule is imported, which Python would put in its place.
+    A package with lazily imported names. If a public name is also that of a submodule
+    (``data.audit``), importing the submodule does not replace it, as it would in Python.
     """
 
     _public: Mapping[str, str]
@@ -68,7 +68,7 @@ _one_at_a_time = threading.RLock()
 
 
 class _Postponed(ModuleType):
-    """A package whose ``__init__`` runs when a name is asked for that its submodules are not."""
+    """A package whose ``__init__`` runs when a name other than a submodule's is first used."""
 
     def __getattr__(self, name: str) -> Any:
         spec: Any = self.__spec__
@@ -88,9 +88,8 @@ class _Postponed(ModuleType):
 
 def postpone(package: str) -> None:
     """
-    Let submodules of a package be imported without all that its ``__init__`` imports, which runs
-    when one of the package's own names is first asked for. Nothing happens where it has run, or
-    where there is no such package.
+    Allow to import submodules of a package without running its ``__init__``, which runs when one of
+    the package's own names is first used. No effect if it has run, or without such a package.
 
     :param package: its name
     """

@@ -165,8 +165,8 @@ def _check_returns(twin: Twin, dtype: Any) -> None:
 
 def _n_positions(twin: Twin, state: Any, dof: int) -> int:
     """
-    Length of a position: one number for each joint; more, as of quaternions, if ``difference``
-    takes it.
+    Length of a position: one number for each joint, or that of the state if ``difference`` accepts
+    it, as with quaternions.
     """
     shape = getattr(getattr(state, "q", None), "shape", None)
     if not isinstance(state, State) or not shape or len(shape) != 1 or shape[0] <= dof:
@@ -270,7 +270,7 @@ def missing_methods(kind: type[Twin]) -> list[str]:
 
 
 def _listed(what: str, signals: Sequence[Any]) -> str:
-    """``"joint (hip, knee)"``, shortened where there are many."""
+    """``"joint (hip, knee)"``, with the first few names."""
     names = [signal.name for signal in signals]
     shown = [*names[:_MAX_NAMES], *(["..."] if len(names) > _MAX_NAMES else [])]
     return f"{what} ({', '.join(shown) or 'none'})"

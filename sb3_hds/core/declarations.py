@@ -72,7 +72,7 @@ class Parameter:
 
     :param null: nominal value; for an effect, the value at which it vanishes
     :param scale: typical deviation from ``null``, in the same unit; must be positive
-    :param unit: SI unit, for example ``"N m s/rad"``; ``"1"`` where there is none
+    :param unit: SI unit, for example ``"N m s/rad"``; ``"1"`` if dimensionless
     :param lower: smallest admissible value
     :param upper: largest admissible value
     :raises ParameterError: if ``scale`` is not positive or ``null`` lies outside the bounds
@@ -114,5 +114,5 @@ class Parameter:
         return value
 
     def prismatic(self) -> "Parameter":
-        """:return: the same parameter with the unit that it has at a sliding joint"""
+        """:return: the same parameter with its unit at a sliding joint"""
         return dataclasses.replace(self, unit=_PRISMATIC_UNIT.get(self.unit, self.unit))

@@ -107,7 +107,7 @@ class Effect(abc.ABC):
     A physical effect of real hardware that the twin lacks. It vanishes at its null parameters.
 
     :param where: index or name of the joint, actuator or channel that it acts on
-    :param values: values of its parameters by name; default: null, where it changes nothing
+    :param values: values of its parameters by name; default: their nulls
     :raises EffectError: for an unknown parameter
     :raises ParameterError: for a value out of bounds
     """

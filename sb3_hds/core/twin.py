@@ -1,4 +1,4 @@
-"""The interface of every differentiable simulator."""
+"""The interface of all differentiable simulators."""
 
 import abc
 import copy
@@ -35,7 +35,7 @@ _Twin = TypeVar("_Twin", bound="Twin")
 
 class State(NamedTuple):
     """
-    The state of a simulation: all that the next step depends on besides action and parameters.
+    The state of a simulation: with action and parameters, it determines the next step.
 
     :param q: generalised position [rad] or [m], shape ``(dof,)``; longer where quaternions are
         among its numbers

@@ -24,7 +24,7 @@ _LIMITS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)
 
 class TorqueGain(ActionEffect):
     r"""
-    Scales the command: the drive is stronger or weaker than the model says.
+    Scales the command: the drive is stronger or weaker than in the model.
 
     .. math:: u' = k\,u
 

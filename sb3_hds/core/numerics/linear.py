@@ -75,15 +75,15 @@ def factorised(matrix: Float[Array, "n n"]) -> Factor:
 
     def column(j: Any, now: tuple[Array, Factor]) -> tuple[Array, Factor]:
         rest, found = now
-        whole = lax.dynamic_index_in_dim(rest, j, 1, keepdims=False)
-        pivot = lax.dynamic_index_in_dim(whole, j, 0, keepdims=False)
-        share = jnp.where(below > j, whole / pivot, 0.0)
-        lower = lax.dynamic_update_index_in_dim(found.lower, share, j, 1)
+        current = lax.dynamic_index_in_dim(rest, j, 1, keepdims=False)
+        pivot = lax.dynamic_index_in_dim(current, j, 0, keepdims=False)
+        scaled = jnp.where(below > j, current / pivot, 0.0)
+        lower = lax.dynamic_update_index_in_dim(found.lower, scaled, j, 1)
         pivots = lax.dynamic_update_index_in_dim(found.pivot, pivot, j, 0)
-        return rest - share[:, None] * whole[None, :], Factor(lower, pivots)
+        return rest - scaled[:, None] * current[None, :], Factor(lower, pivots)
 
-    nothing = Factor(jnp.zeros_like(matrix), jnp.zeros_like(matrix[0]))
-    return lax.fori_loop(0, n, column, (matrix, nothing))[1]
+    empty = Factor(jnp.zeros_like(matrix), jnp.zeros_like(matrix[0]))
+    return lax.fori_loop(0, n, column, (matrix, empty))[1]
 
 
 def solve_factored(factor: Factor, right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:

@@ -103,15 +103,15 @@ def resample(
     time = np.arange(n_steps + 1) * ratio  # [old steps]
     rounded = np.round(time)
     time = np.where(np.abs(time - rounded) < 1e-6, rounded, time)
-    left = np.minimum(time.astype(int), len(actions) - 1)
-    weight = (time - left)[:, None]
-    before, after = obs[left], obs[left + 1]
+    step = np.minimum(time.astype(int), len(actions) - 1)
+    weight = (time - step)[:, None]
+    before, after = obs[step], obs[step + 1]
     columns = list(angles)
     turn = after[:, columns] - before[:, columns]
     after[:, columns] -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
     mixed = (1.0 - weight) * before + weight * after
     mixed[:, columns] -= 2.0 * np.pi * np.floor(mixed[:, columns] / (2.0 * np.pi) + 0.5)
-    return mixed, actions[left[:-1]]
+    return mixed, actions[step[:-1]]
 
 
 def _matrix(argument: str, i: int, array: Any, shape: str) -> np.ndarray:

@@ -31,20 +31,19 @@ def unidentifiable(twin: "MechanismTwin") -> str:
     names = inertial(twin)
     slopes = regressor(twin, names)
     size = np.linalg.norm(slopes, axis=0)
-    nothing = [
-        name for name, length in zip(names, size, strict=True) if length < _RANK * size.max()
-    ]
-    seen = [i for i, name in enumerate(names) if name not in nothing]
-    _, values, directions = np.linalg.svd(slopes[:, seen] / size[seen], full_matrices=True)
-    rank = int(np.sum(values > _RANK * values[0]))
-    alone = np.linalg.norm(directions[rank:], axis=0) < _SHARE
-    together = [names[i] for i, free in zip(seen, alone, strict=True) if not free]
+    visible = size >= _RANK * size.max()
+    scaled = slopes[:, visible] / size[visible]
+    _, values, directions = np.linalg.svd(scaled, full_matrices=True)
+    null_space = directions[int(np.sum(values > _RANK * values[0])) :]
+    combined = np.linalg.norm(null_space, axis=0) >= _SHARE
+    idle = np.array(names)[~visible].tolist()
+    together = np.array(names)[visible][combined].tolist()
     parts = []
-    if nothing:
-        parts.append(f"{len(nothing)} change nothing ({first_names(nothing, _FEW)})")
+    if idle:
+        parts.append(f"{len(idle)} change nothing ({first_names(idle, _FEW)})")
     if together:
         parts.append(
-            f"{len(together)} act only in {len(together) - (len(seen) - rank)} combinations "
+            f"{len(together)} act only in {len(together) - len(null_space)} combinations "
             f"({first_names(together, _FEW)})"
         )
     if not parts:

@@ -194,11 +194,7 @@ def bodies_of(
     for i, link in enumerate(mechanism.links):
         if link.body is None:
             continue
-        own = (
-            _with_values(link.body, p)
-            if masses
-            else spatial.Body(link.body.mass, link.body.centre, _second_moments(link.body.inertia))
-        )
+        own = _with_values(link.body, p) if masses else _nominal(link.body)
         if payload is not None and payload.link == i:
             offset = [p[f"{payload.name}_payload_{axis}"] for axis in _AXES]
             place = alg.vadd(payload.position, alg.apply(payload.rotation, offset))
@@ -216,6 +212,10 @@ def compensated(mechanism: Mechanism) -> list[spatial.Body | None]:
             point = spatial.Body(mass, (centre[0], centre[1], centre[2]), alg.NOTHING)
             found.append(point if link.body.gravcomp else None)
     return found
+
+
+def _nominal(body: Body) -> spatial.Body:
+    return spatial.Body(body.mass, body.centre, _second_moments(body.inertia))
 
 
 def _loaded(own: spatial.Body, mass: Number, place: Vector) -> spatial.Body:

@@ -209,7 +209,7 @@ class MechanismTwin(AnalyticTwin):
         return jnp.concatenate(parts)
 
     def _reference(self, q: Position) -> Position:
-        """Zero of every joint, and no rotation."""
+        """All joints at zero, with unit quaternions."""
         zero = np.zeros(self.mechanism.n_q)
         for link in self.mechanism.links:
             if link.quaternion:

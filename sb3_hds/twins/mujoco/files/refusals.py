@@ -114,15 +114,15 @@ def contacts(model: Any) -> list[str]:
     kinds, affinities = model.geom_contype, model.geom_conaffinity
     meeting = (kinds[own] & affinities[other]) | (kinds[other] & affinities[own])
     one, two = weld[body[own]], weld[body[other]]
-    apart = one != two
+    separate = one != two
     if _enabled(model, "FILTERPARENT"):
         parent = weld[model.body_parentid[weld]]
         above = (one != 0) & (two != 0)
-        apart &= ~(above & ((one == parent[body[other]]) | (two == parent[body[own]])))
+        separate &= ~(above & ((one == parent[body[other]]) | (two == parent[body[own]])))
     low, high = np.minimum(body[own], body[other]), np.maximum(body[own], body[other])
     pair = (low.astype(np.int64) << 16) + high
-    apart &= ~np.isin(pair, model.exclude_signature[: model.nexclude])
-    found = [(int(own[i]), int(other[i])) for i in np.flatnonzero((meeting > 0) & apart)]
+    separate &= ~np.isin(pair, model.exclude_signature[: model.nexclude])
+    found = [(int(own[i]), int(other[i])) for i in np.flatnonzero((meeting > 0) & separate)]
     found += [(int(model.pair_geom1[i]), int(model.pair_geom2[i])) for i in range(model.npair)]
     return [f"{_geom(model, a)} and {_geom(model, b)}" for a, b in found]
 
