@@ -3,7 +3,7 @@
 import abc
 import copy
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -88,6 +88,8 @@ class Twin(abc.ABC):
     known_parameters: frozenset[str] = frozenset()
     #: structural choices with their defaults, set by keyword: ``{"goal": "stop"}``
     options: ClassVar[Mapping[str, Any]] = {}
+    #: admissible values of options that take only a few: ``{"goal": ("stop", "hold")}``
+    choices: ClassVar[Mapping[str, Collection[Any]]] = {}
     #: learned arrays of attached effects, by full name: pytrees that are passed in ``params``
     tensors: Mapping[str, Any] = MappingProxyType({})
 
@@ -106,6 +108,12 @@ class Twin(abc.ABC):
         self.dt, self.substeps = float(dt), int(substeps)
         for option, default in self.options.items():
             setattr(self, option, settings.pop(option, default))
+        for option, allowed in self.choices.items():
+            if (value := getattr(self, option)) not in tuple(allowed):
+                raise ParameterError(
+                    f"{option} of {self.name} must be one of {', '.join(map(repr, allowed))}, got "
+                    f"{value!r}."
+                )
         self.values: dict[str, float] = {
             name: parameter.null for name, parameter in self.parameters.items()
         }

@@ -1,14 +1,11 @@
 """Twin of ``sb3_hds/PayloadPendulum-v0``: a payload that hangs from a driven handle."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State, rk4
 from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position, Scalar, Velocity
-from sb3_hds.errors import ParameterError
 
 _MAX_SPEED = 2.0  # [m/s]
 _SERVO_TIME = 0.05  # [s] time constant of the handle's speed
@@ -59,6 +56,7 @@ class PayloadPendulum(AnalyticTwin):
     integrator = staticmethod(rk4)
     max_episode_steps = 100
     options = {"goal": "stop"}
+    choices = {"goal": _WEIGHTS}
     goal: str
     joints = (Joint("handle_x", "m"), Joint("handle_z", "m"), Joint("swing", "rad"))
     actuators = (
@@ -81,14 +79,6 @@ class PayloadPendulum(AnalyticTwin):
         "damping": Parameter(null=0.05, scale=0.05, unit="N m s/rad", lower=0.0),
     }
     native_effects = {("viscous_friction", 2): {"b": "damping"}}
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings)
-        if self.goal not in _WEIGHTS:
-            raise ParameterError(
-                f"The goal of {self.name} must be one of {', '.join(map(repr, _WEIGHTS))}, "
-                f"got {self.goal!r}."
-            )
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         """Uniform: handle at rest within 1 m in x and z, swing within 1 rad and 2 rad/s."""

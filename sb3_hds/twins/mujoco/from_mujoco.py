@@ -75,19 +75,17 @@ def from_mujoco(
             "they would move apart. To leave that out, pass ignore=['equality']."
         )
     mechanism = read(loaded.model, integrator=integrator)
+    changes: dict[str, Any] = {}
     if loaded.drawn is not None:
-        shapes = shapes_of(loaded.drawn, mechanism.places)
-        mechanism = dataclasses.replace(mechanism, shapes=shapes)
+        changes["shapes"] = shapes_of(loaded.drawn, mechanism.places)
     if "limits" in ignore:
-        links = (dataclasses.replace(link, limit=None) for link in mechanism.links)
-        mechanism = dataclasses.replace(mechanism, links=tuple(links))
+        changes["links"] = tuple(dataclasses.replace(x, limit=None) for x in mechanism.links)
     if actuators is None and not n_actuators(loaded.model):
         actuators = "torque"
     if actuators is not None:
-        drives = tuple(_drives(mechanism, actuators))
-        mechanism = dataclasses.replace(mechanism, drives=drives)
+        changes["drives"] = tuple(_drives(mechanism, actuators))
     twin = MechanismTwin(
-        mechanism,
+        dataclasses.replace(mechanism, **changes),
         observe=observe,
         payload=payload,
         masses=masses,

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 
 from sb3_hds.core import Actuator, Joint, Parameter, State
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
-from sb3_hds.errors import ParameterError
-from sb3_hds.twins.rigs.rig import TILT, Rig, check_length
+from sb3_hds.twins.rigs.rig import TILT, Rig
 
 _SHOULDER, _ELBOW = (Actuator(name, "N m", -math.inf, math.inf) for name in ("motor1", "motor2"))
 _DRIVEN = {"both": (_SHOULDER, _ELBOW), "first": (_SHOULDER,), "second": (_ELBOW,)}
@@ -40,8 +39,8 @@ class DoublePendulum(Rig):
 
     name = "DoublePendulum"
     options = {"driven": "both", "tip": 0.3}
+    choices = {"driven": _DRIVEN}
     driven: str
-    tip: float
     joints = (Joint("joint1", "rad"), Joint("joint2", "rad"))
     actuators = (_SHOULDER, _ELBOW)
     parameters = {
@@ -67,11 +66,6 @@ class DoublePendulum(Rig):
 
     def __init__(self, **settings: object) -> None:
         super().__init__(**settings)  # type: ignore[arg-type]
-        if self.driven not in _DRIVEN:
-            raise ParameterError(
-                f"driven must be one of {', '.join(map(repr, _DRIVEN))}, got {self.driven!r}."
-            )
-        check_length(self.name, "tip", self.tip)
         self.actuators = _DRIVEN[self.driven]
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:

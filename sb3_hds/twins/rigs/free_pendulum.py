@@ -6,10 +6,8 @@ import jax.numpy as jnp
 
 from sb3_hds.core import Actuator, Joint, Parameter, State
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
-from sb3_hds.errors import ParameterError
-from sb3_hds.twins.rigs.rig import TILT, Rig, check_length
+from sb3_hds.twins.rigs.rig import TILT, Rig
 
-_ZEROS = ("down", "up")
 _MOTOR = Actuator("motor", "N m", -math.inf, math.inf)
 
 
@@ -34,9 +32,9 @@ class FreePendulum(Rig):
 
     name = "FreePendulum"
     options = {"zero": "down", "driven": False, "tip": 0.3}
+    choices = {"zero": ("down", "up"), "driven": (True, False)}
     zero: str
     driven: bool
-    tip: float
     joints = (Joint("hinge", "rad"),)
     actuators = ()
     parameters = {
@@ -52,11 +50,6 @@ class FreePendulum(Rig):
 
     def __init__(self, **settings: object) -> None:
         super().__init__(**settings)  # type: ignore[arg-type]
-        if self.zero not in _ZEROS:
-            raise ParameterError(f"zero must be 'down' or 'up', got {self.zero!r}.")
-        check_length(self.name, "tip", self.tip)
-        if self.driven not in (True, False):
-            raise ParameterError(f"driven must be True or False, got {self.driven!r}.")
         self.actuators = (_MOTOR,) if self.driven else ()
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from sb3_hds.core import Actuator, Joint, Parameter, State
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Scalar, Velocity
-from sb3_hds.twins.rigs.rig import TILT, Rig, check_length
+from sb3_hds.twins.rigs.rig import TILT, Rig
 
 
 class Furuta(Rig):
@@ -38,7 +38,6 @@ class Furuta(Rig):
 
     name = "Furuta"
     options = {"tip": 0.13}
-    tip: float
     joints = (Joint("arm", "rad"), Joint("pendulum", "rad"))
     actuators = (Actuator("motor", "N m", -math.inf, math.inf),)
     parameters = {
@@ -58,10 +57,6 @@ class Furuta(Rig):
         ("viscous_friction", 0): {"b": "arm_damping"},
         ("viscous_friction", 1): {"b": "pendulum_damping"},
     }
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings)
-        check_length(self.name, "tip", self.tip)
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:
         return jnp.stack([action[0], jnp.zeros_like(action[0])])

@@ -24,7 +24,7 @@ class Rig(AnalyticTwin):
 
     :param observe: ``"q"`` for positions only, as of encoders, ``"qv"`` for velocities too
     :param settings: as for every twin
-    :raises ParameterError: for another ``observe``
+    :raises ParameterError: for another ``observe``, or a ``tip`` that is not a length
     """
 
     dt = 0.01
@@ -33,12 +33,17 @@ class Rig(AnalyticTwin):
     #: valid values of ``observe``
     observable: tuple[str, ...] = ("q", "qv")
     observed: str
+    #: option of pendulums: distance of a payload from the last joint [m]
+    tip: float
 
     def __init__(self, *, observe: str = "qv", **settings: Any) -> None:
         super().__init__(**settings)
         if observe not in self.observable:
-            choices = " or ".join(map(repr, self.observable))
-            raise ParameterError(f"{self.name} can observe {choices}, got {observe!r}.")
+            allowed = " or ".join(map(repr, self.observable))
+            raise ParameterError(f"{self.name} can observe {allowed}, got {observe!r}.")
+        tip = getattr(self, "tip", 1.0)
+        if not (isinstance(tip, int | float) and 0.0 < tip < math.inf):
+            raise ParameterError(f"tip of {self.name} must be a length above 0 m, got {tip!r}.")
         self.observed = observe
         self.channels = self.channels_of(observe)
 
@@ -68,9 +73,3 @@ class Rig(AnalyticTwin):
 
     def structure(self) -> tuple[Any, ...]:
         return (*super().structure(), self.observed)
-
-
-def check_length(twin: str, option: str, value: Any) -> None:
-    """:raises ParameterError: for an option that is no length"""
-    if not (isinstance(value, int | float) and 0.0 < value < math.inf):
-        raise ParameterError(f"{option} of {twin} must be a length above 0 m, got {value!r}.")

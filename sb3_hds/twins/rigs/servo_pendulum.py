@@ -6,7 +6,6 @@ import jax.numpy as jnp
 
 from sb3_hds.core import Actuator, Joint, Parameter, State
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
-from sb3_hds.errors import ParameterError
 from sb3_hds.twins.rigs.rig import TILT, Rig
 
 _GOAL = Actuator("goal", "rad", -math.pi, math.pi)
@@ -42,6 +41,7 @@ class ServoPendulum(Rig):
     name = "ServoPendulum"
     dt = 0.005
     options = {"commands": "goal"}
+    choices = {"commands": _COMMANDS}
     commands: str
     joints = (Joint("servo", "rad"),)
     actuators = (_GOAL,)
@@ -64,10 +64,6 @@ class ServoPendulum(Rig):
         if settings.get("commands") == _LOGGED_GAIN:
             self.parameters = {n: p for n, p in self.parameters.items() if n != "kp"}
         super().__init__(**settings)  # type: ignore[arg-type]
-        if self.commands not in _COMMANDS:
-            raise ParameterError(
-                f"commands must be one of {', '.join(map(repr, _COMMANDS))}, got {self.commands!r}."
-            )
         self.actuators = _COMMANDS[self.commands]
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:
