@@ -32,10 +32,13 @@ def episodes_in(
             f"got observations of {buffer.observation_space}."
         )
     shared = bool(getattr(buffer, "optimize_memory_usage", False))
-    order = _oldest_first(buffer, shared)
+    # Oldest first.
+    order = np.arange(buffer.pos)
+    if buffer.full:
+        order = (buffer.pos + np.arange(int(shared), buffer.buffer_size)) % buffer.buffer_size
+    following = (order + 1) % buffer.buffer_size
     space = buffer.action_space if action_space is None else action_space
     commands = _unscaled(buffer, space, scaled)
-    following = (order + 1) % buffer.buffer_size
     obs, actions, begins = [], [], []
     first = int(shared and buffer.full)
     for env in range(buffer.n_envs):
@@ -61,12 +64,6 @@ def _finite_runs(steps: np.ndarray, before: np.ndarray, after: np.ndarray) -> li
     finite = np.all(np.isfinite(before[steps]) & np.isfinite(after[steps]), axis=1)
     runs = np.split(steps, np.flatnonzero(np.diff(finite.astype(int))) + 1) if len(steps) else []
     return [run for run in runs if finite[run[0] - steps[0]]]
-
-
-def _oldest_first(buffer: Any, shared: bool) -> np.ndarray:
-    if not buffer.full:
-        return np.arange(buffer.pos)
-    return (buffer.pos + np.arange(int(shared), buffer.buffer_size)) % buffer.buffer_size
 
 
 def _unscaled(buffer: Any, space: Any, scaled: bool) -> np.ndarray:

@@ -79,22 +79,19 @@ class Rhythm(StatefulTransform):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.mode not in self.modes:
-            wanted = ", ".join(map(repr, self.modes))
-            raise ParameterError(f"Rhythm(mode={self.mode!r}): mode must be one of {wanted}.")
+        wanted = f"one of {', '.join(map(repr, self.modes))}"
+        self.refuse_unless("mode", self.mode in self.modes, wanted)
         for name in ("omega_swing", "omega_stance", "amplitude_gain", "dt"):
-            if not (math.isfinite(value := getattr(self, name)) and value > 0.0):
-                raise ParameterError(f"Rhythm({name}={value}): {name} must be above 0 and finite.")
+            self.refuse_unless(name, 0.0 < getattr(self, name) < math.inf, "above 0 and finite")
         for name in ("amplitude_factor", "frequency_factor"):
             self.refuse_unless(name, len(getattr(self, name)) == 2, "smallest and largest")
             low, high = getattr(self, name)
-            if not (0.0 <= low < high < math.inf and (low > 0.0 or name[0] == "a")):
-                raise ParameterError(f"Rhythm({name}={[low, high]}): needs 0 <= lowest < highest.")
+            fine = 0.0 <= low < high < math.inf and (low > 0.0 or name == "amplitude_factor")
+            bound = "0 <=" if name == "amplitude_factor" else "0 <"
+            self.refuse_unless(name, fine, f"{bound} smallest < largest")
         for name in _PER_JOINT:
-            if not np.isfinite(np.asarray(getattr(self, name), float)).all():
-                raise ParameterError(
-                    f"Rhythm({name}={getattr(self, name)}): {name} must be finite."
-                )
+            values = np.asarray(getattr(self, name), float)
+            self.refuse_unless(name, bool(np.isfinite(values).all()), "finite")
         both = len(self.position) == len(self.velocity)
         self.refuse_unless("velocity", both, f"as many as positions ({len(self.position)})")
 

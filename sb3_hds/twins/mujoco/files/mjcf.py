@@ -37,11 +37,7 @@ def mjcf_of(correction: Correction, source: Any, target: Path) -> str:
     by_id = {joint.id: joint for joint in spec.joints}
     for index, link in enumerate(mechanism.links):
         _write_joint(correction, by_id[index], link, float(spec.option.timestep))
-    tilted = [
-        name
-        for name in correction.values
-        if name.startswith("tilt_") and correction.difference(name)
-    ]
+    tilted = [n for n in correction.values if n.startswith("tilt_") and correction.difference(n)]
     if tilted:
         spec.option.gravity = np.array(gravity_of(mechanism, correction.values), float)
         for name in tilted:

@@ -75,13 +75,14 @@ def _never(model: Any, integrator: str) -> list[str]:
             "MuJoCo's implicitfast is another one for a body that floats alone "
             f"({first_names(alone)}). Pass integrator='euler' or 'rk4'."
         )
-    on = {mj.mjtTrn.mjTRN_JOINT, mj.mjtTrn.mjTRN_JOINTINPARENT}
+    on = [int(mj.mjtTrn.mjTRN_JOINT), int(mj.mjtTrn.mjTRN_JOINTINPARENT)]
+    # Not all versions of MuJoCo have all of these.
+    gains = [getattr(mj.mjtGain, f"mjGAIN_{name}", None) for name in ("MUSCLE", "SO3", "USER")]
+    special = [int(gain) for gain in gains if gain is not None]
     kinds = {
         "with internal dynamics": model.actuator_actnum > 0,
-        "that are not attached to a joint": ~np.isin(model.actuator_trntype, [int(k) for k in on]),
-        "that are muscles or turn an orientation": np.isin(
-            model.actuator_gaintype, [int(k) for k in _special_gains()]
-        ),
+        "that are not attached to a joint": ~np.isin(model.actuator_trntype, on),
+        "that are muscles or turn an orientation": np.isin(model.actuator_gaintype, special),
         "with a delay": getattr(model, "actuator_delay", np.zeros(n_actuators(model))) > 0.0,
     }
     hints = {
@@ -140,16 +141,6 @@ def _floating_alone(model: Any) -> list[str]:
         if model.body_subtreemass[body] == model.body_mass[body]:
             found.append(model.body(body).name or f"body {body}")
     return found
-
-
-def _special_gains() -> list[Any]:
-    mj = mujoco()
-    gains = mj.mjtGain
-    return [
-        getattr(gains, f"mjGAIN_{n}")
-        for n in ("MUSCLE", "SO3", "USER")
-        if hasattr(gains, f"mjGAIN_{n}")
-    ]
 
 
 def _enabled(model: Any, name: str) -> bool:

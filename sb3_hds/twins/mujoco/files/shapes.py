@@ -67,27 +67,19 @@ def _loose_bodies(robot: ElementTree.Element, folder: Path) -> Any:
             if mesh is None or path is None:
                 continue
             at = {} if origin is None else origin.attrib
-            scale, place, turn = (
-                [float(x) for x in given.split()]
-                for given in (
-                    mesh.get("scale", "1 1 1"),
-                    at.get("xyz", "0 0 0"),
-                    at.get("rpy", "0 0 0"),
-                )
-            )
+            scale = [float(x) for x in mesh.get("scale", "1 1 1").split()]
+            place, turn = ([float(x) for x in at.get(n, "0 0 0").split()] for n in ("xyz", "rpy"))
             quaternion = np.zeros(4)
             mj.mju_euler2Quat(quaternion, turn, "XYZ")
             spec.add_mesh(name=f"mesh{n}", file=str(path), scale=scale)
-            body = body or _body_of(spec, link.get("name", ""))
+            if body is None:
+                name, world = link.get("name", ""), spec.worldbody
+                body = world if name == "world" else world.add_body(name=name)
             body.add_geom(
                 type=mj.mjtGeom.mjGEOM_MESH, meshname=f"mesh{n}", pos=place, quat=quaternion
             )
             n += 1
     return spec.compile() if n else None
-
-
-def _body_of(spec: Any, name: str) -> Any:
-    return spec.worldbody if name == "world" else spec.worldbody.add_body(name=name)
 
 
 def _found(name: str, folder: Path) -> Path | None:
