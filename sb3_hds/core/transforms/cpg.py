@@ -83,12 +83,11 @@ class Rhythm(StatefulTransform):
         self.refuse_unless("mode", self.mode in self.modes, wanted)
         for name in ("omega_swing", "omega_stance", "amplitude_gain", "dt"):
             self.refuse_unless(name, 0.0 < getattr(self, name) < math.inf, "above 0 and finite")
-        for name in ("amplitude_factor", "frequency_factor"):
+        for name, least in (("amplitude_factor", "0 <="), ("frequency_factor", "0 <")):
             self.refuse_unless(name, len(getattr(self, name)) == 2, "smallest and largest")
             low, high = getattr(self, name)
-            fine = 0.0 <= low < high < math.inf and (low > 0.0 or name == "amplitude_factor")
-            bound = "0 <=" if name == "amplitude_factor" else "0 <"
-            self.refuse_unless(name, fine, f"{bound} smallest < largest")
+            fine = 0.0 <= low < high < math.inf and (low > 0.0 or least == "0 <=")
+            self.refuse_unless(name, fine, f"{least} smallest < largest")
         for name in _PER_JOINT:
             values = np.asarray(getattr(self, name), float)
             self.refuse_unless(name, bool(np.isfinite(values).all()), "finite")
