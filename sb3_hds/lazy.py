@@ -45,14 +45,14 @@ def lazy_imports(package: str) -> Iterator[None]:
     module: Any = sys.modules[package]
     homes: dict[str, str] = {}
 
-    def record(name: str, globals_: Any = None, *arguments: Any, **keywords: Any) -> Any:
-        if globals_ is not module.__dict__:
-            return usual(name, globals_, *arguments, **keywords)
-        names = arguments[1]
+    def record(name: str, *arguments: Any, **keywords: Any) -> Any:
+        if not (arguments and arguments[0] is module.__dict__):  # of another module, in a thread
+            return usual(name, *arguments, **keywords)
+        names = arguments[2]
         homes.update(dict.fromkeys(names, name))
         return SimpleNamespace(**dict.fromkeys(names))
 
-    with _one_at_a_time:
+    with _patching:
         usual, builtins.__import__ = builtins.__import__, record
         try:
             yield
@@ -64,7 +64,8 @@ def lazy_imports(package: str) -> Iterator[None]:
     module.__class__ = _Package
 
 
-_one_at_a_time = threading.RLock()
+# Two locks: what runs under the second one may import packages that need the first one.
+_patching, _one_at_a_time = threading.RLock(), threading.RLock()
 
 
 class _Postponed(ModuleType):
