@@ -264,11 +264,6 @@ class _Caller:
         )
 
 
-def missing_methods(kind: type[Twin]) -> list[str]:
-    """:return: the abstract methods that a class does not implement"""
-    return sorted(getattr(kind, "__abstractmethods__", ())) if inspect.isabstract(kind) else []
-
-
 def _listed(what: str, signals: Sequence[Any]) -> str:
     """``"joint (hip, knee)"``, with the first few names."""
     names = [signal.name for signal in signals]

@@ -336,9 +336,7 @@ class SensorEffect(Effect):
 
     @abc.abstractmethod
     def invert(self, reported: Scalar, params: Params) -> Scalar:
-        """
-        :return: the best estimate of the true value from the first report of an episode
-        """
+        """:return: the best estimate of the true value from the first report of an episode"""
 
     def advance(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Memory:
         """:return: the memory after a control interval that ends with the value ``measured``"""

@@ -241,9 +241,7 @@ class Twin(abc.ABC):
         return jnp.zeros((), bool)
 
     def coordinates(self, q: Position) -> Coordinates:
-        """
-        :return: the position of each joint, for effects and reports; override for quaternions
-        """
+        """:return: the position of each joint, for effects and reports; override for quaternions"""
         return q
 
     def difference(self, state: State, reference: State) -> Tangent:

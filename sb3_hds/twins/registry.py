@@ -7,7 +7,7 @@ from typing import Any
 
 from sb3_hds.core import Effect, Twin, seen_through
 from sb3_hds.core.belief import belief_from_spec
-from sb3_hds.core.contract import check_methods, missing_methods
+from sb3_hds.core.contract import check_methods
 from sb3_hds.errors import NoTwinError, TwinError, did_you_mean
 
 _TWINS: dict[str, type[Twin]] = {}
@@ -41,7 +41,7 @@ def register(twin: type[Twin], *, listed: bool = True) -> type[Twin]:
                 f"'{key}' is already the twin {other.__qualname__}. "
                 f"Choose another name for {twin!r}."
             )
-    if missing := missing_methods(twin):
+    if missing := sorted(getattr(twin, "__abstractmethods__", ())):
         raise TwinError(
             f"{twin.__name__} lacks {', '.join(missing)}: implement what is abstract in "
             f"{twin.__mro__[1].__name__}."

@@ -68,7 +68,8 @@ def keep_programs() -> Path | None:
         return Path(held) if held in _folders else None
     if given == "" or not jax.config.values.get("jax_enable_compilation_cache", True):
         return None
-    folder = Path(given).expanduser() if given else _default_folder()
+    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(given).expanduser() if given else Path(caches, "sb3_hds", "xla")
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError:
@@ -176,8 +177,3 @@ def _processor() -> str:
         described = platform.processor()
     described += platform.machine()
     return hashlib.blake2b(described.encode(), digest_size=4).hexdigest()
-
-
-def _default_folder() -> Path:
-    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(caches, "sb3_hds", "xla")

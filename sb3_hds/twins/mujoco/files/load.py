@@ -113,7 +113,8 @@ def _compiled(parsed: Callable[[], Any], where: str) -> tuple[Any, Any]:
         spec = parsed()
         return spec.compile(), spec
     except ValueError as error:
-        if not _is_about_files(error):
+        about_files = ("file", "mesh", "texture", "resource")
+        if not any(word in str(error).lower() for word in about_files):
             raise ModelFileError(f"MuJoCo refuses {where}: {_first_line(error)}.") from None
     spec = parsed()
     shapes = [getattr(mj.mjtGeom, name) for name in ("mjGEOM_MESH", "mjGEOM_HFIELD", "mjGEOM_SDF")]
@@ -130,10 +131,6 @@ def _compiled(parsed: Callable[[], Any], where: str) -> tuple[Any, Any]:
             names = ", ".join(sorted(bare))
             hint = f" No inertial says what {names} weighs, and its mesh is missing."
         raise ModelFileError(f"MuJoCo refuses {where}: {_first_line(error)}.{hint}") from None
-
-
-def _is_about_files(error: Exception) -> bool:
-    return any(word in str(error).lower() for word in ("file", "mesh", "texture", "resource"))
 
 
 def _mimics(text: str) -> list[str]:
