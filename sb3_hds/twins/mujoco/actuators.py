@@ -151,14 +151,10 @@ class _Servos(_Drives):
             np.array([getattr(drive, name) for drive in self.drives]).T for name in ("gain", "bias")
         )
         # At a ball joint, targets that differ by full turns are the same.
-        self.period = np.array(
-            [
-                2.0 * math.pi * math.hypot(*drive.gear)
-                if link.kind == BALL and drive.role == "position"
-                else 0.0
-                for link, drive in zip(self.links, self.drives, strict=True)
-            ]
-        )
+        pairs = zip(self.links, self.drives, strict=True)
+        turning = [link.kind == BALL and drive.role == "position" for link, drive in pairs]
+        sizes = [math.hypot(*drive.gear) for drive in self.drives]
+        self.period = np.where(turning, 2.0 * math.pi * np.array(sizes), 0.0)
 
     def pull(self, moving: Moving, command: Action, p: Params) -> Pull:
         gear, length, speed = self.geared(moving)

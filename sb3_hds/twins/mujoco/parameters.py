@@ -96,28 +96,21 @@ def native_effects(mechanism: Mechanism) -> dict[tuple[str, int], dict[str, str]
 
 def _of_link(link: Link, inertias: np.ndarray, forces: np.ndarray) -> dict[str, Parameter]:
     """The parameters of a joint; for a floating base, only those that are not zero."""
-    turns = link.kind != SLIDE
-    i, free = link.dofs[-1], link.kind == FREE
-    force = float(forces[i]) or 1.0
-    units = ("N m s/rad", "N m", "kg m2", "N m/rad") if turns else ("N s/m", "N", "kg", "N/m")
-    values = (
-        link.damping[0][0] if link.damping[0] else 0.0,
-        link.friction[0],
-        link.armature[0],
-        link.stiffness[0] if link.stiffness else 0.0,
-    )
-    scales = (
-        _OF_FORCE_PER_SPEED * force,
-        _OF_FORCE * force,
-        _OF_INERTIA * float(inertias[i]),
-        0.0,
-    )
+    i = link.dofs[-1]
+    force, inertia = float(forces[i]) or 1.0, float(inertias[i])
+    damping = link.damping[0][0] if link.damping[0] else 0.0
+    stiffness = link.stiffness[0] if link.stiffness else 0.0
+    # Value, scale, and the units of rotary and sliding joints.
+    declared = {
+        "damping": (damping, _OF_FORCE_PER_SPEED * force, "N m s/rad", "N s/m"),
+        "frictionloss": (link.friction[0], _OF_FORCE * force, "N m", "N"),
+        "armature": (link.armature[0], _OF_INERTIA * inertia, "kg m2", "kg"),
+        "stiffness": (stiffness, 0.0, "N m/rad", "N/m"),
+    }
     found = {}
-    names = ("damping", "frictionloss", "armature", "stiffness")
-    for name, value, scale, unit in zip(names, values, scales, units, strict=True):
-        wanted = scale > 0.0 and not free
-        if wanted or value:
-            scale = max(scale, _OF_ITSELF * abs(value))
+    for name, (value, scale, *units) in declared.items():
+        if value or (scale > 0.0 and link.kind != FREE):
+            scale, unit = max(scale, _OF_ITSELF * abs(value)), units[link.kind == SLIDE]
             found[f"{link.joint}_{name}"] = Parameter(value, scale, unit, min(value, 0.0))
     return found
 
