@@ -24,7 +24,7 @@ _MAX_NAMES = 4
 _REMEDIES = {
     "TracerBoolConversionError": "Replace `if` on an array by jnp.where.",
     "ConcretizationTypeError": "Replace `if` and float() on an array by jnp.where and jnp.",
-    "TracerArrayConversionError": "Use jax.numpy in place of numpy and math.",
+    "TracerArrayConversionError": "Use jax.numpy instead of numpy and math.",
 }
 
 
@@ -42,8 +42,8 @@ def check_methods(twin: Twin) -> None:
         hash(twin)
     except TypeError as error:
         raise TwinError(
-            f"The options of {type(twin).__name__} must be hashable, for equal twins share a "
-            f"compiled program: {error}. Use tuples in place of lists."
+            f"The options of {type(twin).__name__} must be hashable, because equal twins share a "
+            f"compiled program: {error}. Use tuples instead of lists."
         ) from None
     for layer in reversed(list(layers_of(twin))):
         if not _is_from_library(layer):

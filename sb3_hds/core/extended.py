@@ -37,8 +37,8 @@ class ExtendedTwin(Layer):
     def __init__(self, base: Twin, *effects: Effect) -> None:
         if isinstance(base, TransformedTwin):
             raise EffectError(
-                "Effects belong to the plant, below the wrapper that a TransformedTwin stands for. "
-                "Use twin.extend(*effects), which attaches them there."
+                "Effects must be attached to the plant, not to a TransformedTwin around it. Use "
+                "twin.extend(*effects), which does that."
             )
         if isinstance(base, ExtendedTwin):
             base, effects = base._base_with_values(), (*base.effects_with_values(), *effects)
@@ -53,8 +53,8 @@ class ExtendedTwin(Layer):
         counts = Counter(a.key for a in self.attached)
         if repeated := [key for key, count in counts.items() if count > 1]:
             raise EffectError(
-                f"An effect can be attached once at each place; {', '.join(repeated)} "
-                "came more than once."
+                f"An effect can be attached once at each place; {', '.join(repeated)} was given "
+                "more than once."
             )
         self._mirror(base)
         for a in self.attached:

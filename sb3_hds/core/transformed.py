@@ -74,8 +74,8 @@ class TransformedTwin(Layer):
     ) -> None:
         if stateful is not None and (observation is not None or action is not None):
             raise ParameterError(
-                f"{type(stateful).__name__} is a wrapper of its own: put one TransformedTwin into "
-                "another instead of passing several transforms."
+                f"{type(stateful).__name__} cannot be combined with other transforms: put one "
+                "TransformedTwin into another."
             )
         self.base, self.observation, self.action = base, observation, action
         self.stateful = stateful
@@ -207,8 +207,8 @@ def transform_from_spec(
     by_name = {transform.name: transform for transform in known}
     if spec["transform"] not in by_name:
         raise ParameterError(
-            f"A twin was saved with the transform '{spec['transform']}', which is not known here. "
-            f"Known are: {', '.join(by_name)}."
+            f"A twin was saved with the unknown transform '{spec['transform']}'. Known transforms: "
+            f"{', '.join(by_name)}."
         )
     fields = {name: value for name, value in spec.items() if name != "transform"}
     return by_name[spec["transform"]](**fields)

@@ -73,7 +73,8 @@ class NeuralForce(ForceEffect):
         super().__init__(where, **values)
         if n_members < 1 or not all(width >= 1 for width in net_arch):
             raise EffectError(
-                f"An ensemble needs members and units, got {n_members} of {tuple(net_arch)}."
+                f"An ensemble needs at least one member, and layers at least one unit, got "
+                f"{n_members} of {tuple(net_arch)}."
             )
         self.n_members, self.net_arch = int(n_members), tuple(int(width) for width in net_arch)
         self.caution = float(caution)
@@ -84,8 +85,8 @@ class NeuralForce(ForceEffect):
         hinges = tuple(joint.unit == "rad" for joint in twin.joints)
         if self.tensors and hinges != self.hinges:
             raise EffectError(
-                f"This NeuralForce was learned on {len(self.hinges)} joint(s) of other kinds than "
-                f"those of {twin.name}. Learn it again: sysid.fit_residual."
+                f"This NeuralForce was learned for {len(self.hinges)} joint(s), other than those "
+                f"of {twin.name}. Learn it again: sysid.fit_residual."
             )
         if self.tensors:
             return self

@@ -160,7 +160,7 @@ def reversed_joint(twin: "Twin", joint: int | str) -> tuple[SignFlip, ...]:
     channels = np.array([channel.name for channel in twin.channels])
     if (changed & ~odd).any():
         raise EffectError(
-            f"Turning {names[index]} round changes more than the sign of: "
-            f"{', '.join(channels[changed & ~odd])}. A flip of channels cannot say that."
+            f"Reversing {names[index]} changes more than the sign of: "
+            f"{', '.join(channels[changed & ~odd])}. SignFlip cannot represent that."
         )
     return tuple(SignFlip(name, flipped=1.0) for name in channels[odd].tolist())

@@ -43,7 +43,7 @@ def register(twin: type[Twin], *, listed: bool = True) -> type[Twin]:
             )
     if missing := sorted(getattr(twin, "__abstractmethods__", ())):
         raise TwinError(
-            f"{twin.__name__} lacks {', '.join(missing)}: implement what is abstract in "
+            f"{twin.__name__} lacks {', '.join(missing)}: implement the abstract methods of "
             f"{twin.__mro__[1].__name__}."
         )
     if _has_defaults(twin):
@@ -131,7 +131,7 @@ def from_spec(spec: Mapping[str, Any], effects: Iterable[type[Effect]] = ()) -> 
     missing = {part["effect"] for part in spec.get("effects", ())} - set(known)
     if missing:
         raise NoTwinError(
-            f"The twin '{spec['twin']}' was saved with effects that are not known here: {missing}."
+            f"The twin '{spec['twin']}' was saved with unknown effects: {', '.join(missing)}."
         )
     attached = [
         known[part["effect"]](part["where"], **part.get("options", {}), **part["parameters"])
@@ -146,21 +146,21 @@ def _imported(module: str, name: str) -> type[Twin]:
     """Import a module and return the twin that it registers under a name."""
     wanted = f"{module}:{name}"
     if not (name and all(part.isidentifier() for part in module.split("."))):
-        raise NoTwinError(f"A twin of one's own is asked for as module:Name, got '{wanted}'.")
+        raise NoTwinError(f"Name a twin of your own as module:Name, got '{wanted}'.")
     try:
         importlib.import_module(module)
     except ImportError as error:
         raise NoTwinError(
-            f"There is no twin for '{wanted}': the module cannot be imported ({error}). It has to "
-            "be installed, or its folder on the path of Python (PYTHONPATH)."
+            f"There is no twin for '{wanted}': the module cannot be imported ({error}). Install "
+            "it, or add its folder to PYTHONPATH."
         ) from error
     if name in _TWINS:
         return _TWINS[name]
     theirs = [key for key, twin in _TWINS.items() if twin.__module__ == module]
     raise NoTwinError(
         f"There is no twin for '{wanted}': module '{module}' registers "
-        f"{', '.join(sorted(theirs)) or 'no twin'}, not '{name}'. What counts is the 'name' or "
-        "'env_id' of a class that is decorated with @twins.register."
+        f"{', '.join(sorted(theirs)) or 'no twin'}, not '{name}'. Use the 'name' or 'env_id' of a "
+        "class that is decorated with @twins.register."
     )
 
 

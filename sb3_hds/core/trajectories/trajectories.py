@@ -132,7 +132,7 @@ class Trajectories:
         for part in parts:
             if not same_interval(part.dt, parts[0].dt):
                 raise TrajectoryError(
-                    f"Only trajectories of one dt can be joined, got {parts[0].dt} s and "
+                    f"Only trajectories of equal dt can be joined, got {parts[0].dt} s and "
                     f"{part.dt} s. Resample first: part.resample(dt={parts[0].dt})."
                 )
         episodes = [part.episode(i) for part in parts for i in range(len(part))]
@@ -271,7 +271,7 @@ class Trajectories:
         if not cuts:
             raise TrajectoryError(
                 f"No trajectory has {length} steps; the longest has {self.lengths.max()}. "
-                "Ask for shorter windows."
+                "Choose shorter windows."
             )
         source, start = np.array(cuts).T
         steps = start[:, None] + np.arange(length + 1)
@@ -310,7 +310,7 @@ class Trajectories:
         if len(groups) < 2:
             raise TrajectoryError(
                 f"A split by {by} needs at least two of them, got {len(groups)} among "
-                f"{len(self)} trajectories. Record more, or cut the recording up yourself."
+                f"{len(self)} trajectories. Record more, or split the recording yourself."
             )
         n_first = min(max(round(fraction * len(groups)), 1), len(groups) - 1)
         drawn = np.random.default_rng(seed).permutation(groups)[:n_first]

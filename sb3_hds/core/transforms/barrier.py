@@ -85,13 +85,13 @@ class Barrier(StatefulTransform):
         for i in self.action:
             if not 0 <= i < len(below.actuators) or not low[i] < 0.0 < high[i]:
                 raise ParameterError(
-                    f"Barrier needs speeds that can be zero and of either sign; command {i} is not "
-                    f"among those with such limits: {low.tolist()} to {high.tolist()}."
+                    f"Barrier needs speeds of either sign; the limits of command {i} do not allow "
+                    f"that: {low.tolist()} to {high.tolist()}."
                 )
         if not below.channels:
             raise ParameterError(
-                "A barrier reads positions from observations that are a Box with one axis: flatten "
-                "them below (gymnasium.wrappers.FlattenObservation)."
+                "A barrier reads positions from observations that are a Box with one axis: wrap "
+                "the environment in gymnasium.wrappers.FlattenObservation first."
             )
         indices = [i for place in self.position for i in _indices(place)]
         if not all(0 <= i < len(below.channels) for i in indices):

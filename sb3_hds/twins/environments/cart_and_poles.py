@@ -51,9 +51,9 @@ def require(condition: Any, expected: str) -> None:
     """:raises EnvironmentMismatchError: if the model violates an assumption of the twin"""
     if not condition:
         raise EnvironmentMismatchError(
-            f"The twin expects {expected}, but the environment's XML has it otherwise. "
-            "Masses, shapes, damping, armature, gravity, gear and time step are free to change; "
-            "for anything else, pass a twin of your own."
+            f"The twin expects {expected}, and the environment's XML differs. Masses, shapes, "
+            "damping, armature, gravity, gear and time step may change; for anything else, pass "
+            "your own twin."
         )
 
 

@@ -61,8 +61,8 @@ def from_mujoco(
     """
     if engine not in ("auto", "smooth"):
         raise ParameterError(
-            "engine must be 'smooth' or 'auto': MuJoCo's own engine, with contacts, does not serve "
-            f"as a twin yet; got {engine!r}. Where nothing touches, pass ignore=['contacts']."
+            "engine must be 'smooth' or 'auto': MuJoCo's own engine, with contacts, is not a twin "
+            f"yet; got {engine!r}. If there are no contacts in the data, pass ignore=['contacts']."
         )
     loaded = load(model_or_path_or_env)
     if integrator is None:
@@ -71,8 +71,8 @@ def from_mujoco(
     refuse(loaded.model, integrator, ignore)
     if loaded.mimics and not loaded.model.neq and "equality" not in ignore:
         raise ModelFileError(
-            f"Joints follow others ({', '.join(loaded.mimics)}), which the twin does not simulate: "
-            "they would move apart. To leave that out, pass ignore=['equality']."
+            f"Joints mimic others ({', '.join(loaded.mimics)}), which the twin does not simulate: "
+            "they would move independently. To accept that, pass ignore=['equality']."
         )
     mechanism = read(loaded.model, integrator=integrator)
     changes: dict[str, Any] = {}

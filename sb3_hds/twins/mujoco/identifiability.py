@@ -49,8 +49,8 @@ def unidentifiable(twin: "MechanismTwin") -> str:
     if not parts:
         return ""
     return (
-        f"Of {len(names)} inertial parameters of {twin.name}, {', and '.join(parts)}: no data tell "
-        "these one by one. Free fewer of them, or calibrate with a prior."
+        f"Of {len(names)} inertial parameters of {twin.name}, {', and '.join(parts)}: no data can "
+        "identify these one by one. Estimate fewer of them, or calibrate with a prior."
     )
 
 

@@ -121,8 +121,8 @@ def arranged(twin: MechanismTwin, data: Trajectories) -> Trajectories:
     report: Any = data.report
     if report is None:
         raise TrajectoryError(
-            "These data do not carry the names of their columns, so joints cannot be matched by "
-            "name. Read them from their log: Trajectories.load(files, columns)."
+            "These data do not carry the names of their columns, so joints cannot be matched. Read "
+            "them from their log: Trajectories.load(files, columns)."
         )
     actions = [f"{name} command" for name in report.actions]
     found = match(twin, [*report.obs, *actions])

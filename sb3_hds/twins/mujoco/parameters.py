@@ -325,7 +325,7 @@ def place_of(mechanism: Mechanism, name: str) -> Place:
     if found[name].link < 0:
         moving = [place.name for place in found.values() if place.link >= 0]
         raise ParameterError(
-            f"A payload at '{name}' of {mechanism.name} would not move, so no data tell of it. "
+            f"A payload at '{name}' of {mechanism.name} does not move, so it cannot be identified. "
             f"Choose one of: {', '.join(moving) or 'none'}."
         )
     return found[name]

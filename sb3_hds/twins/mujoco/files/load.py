@@ -44,8 +44,8 @@ def load(source: Any) -> Loaded:
     if isinstance(model, mj.MjModel):
         return Loaded(model, float(source.unwrapped.dt), drawn=model)
     raise ModelFileError(
-        "A model is the path of an MJCF or URDF file, an MjSpec, an MjModel, or an environment of "
-        f"Gymnasium with MuJoCo inside, got {type(source).__name__}."
+        "A model is the path of an MJCF or URDF file, an MjSpec, an MjModel, or a MuJoCo "
+        f"environment of Gymnasium, got {type(source).__name__}."
     )
 
 

@@ -48,7 +48,7 @@ def _ignorable(model: Any) -> dict[str, str]:
         ]
         found["equality"] = (
             f"Constraints close chains or couple joints ({first_names(active)}), which the twin "
-            "does not simulate: joints would move apart."
+            "does not simulate: joints would move independently."
         )
     if model.ntendon:
         names = [model.tendon(i).name or f"tendon {i}" for i in range(model.ntendon)]

@@ -30,7 +30,7 @@ def urdf_of(correction: Correction, source: Any) -> str:
     try:
         robot = ElementTree.fromstring(text, ElementTree.XMLParser(target=builder))
     except ElementTree.ParseError as error:
-        raise ModelFileError(f"The source is no XML: {error}.") from None
+        raise ModelFileError(f"The source is not XML: {error}.") from None
     if robot.tag != "robot":
         raise ModelFileError(
             "A URDF is written only where the twin comes from one. Write MJCF: name the file .xml."
