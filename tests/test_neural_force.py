@@ -101,7 +101,7 @@ def test_it_survives_a_file_and_its_spec_with_its_tensors(tmp_path):
         np.testing.assert_array_equal(end_of(other), end_of(twin))
     np.load(path, allow_pickle=False).close()
     (other,) = twins.make("Pendulum").extend(NeuralForce()).effects_with_values()
-    with pytest.raises(EffectError, match="other kinds"):
+    with pytest.raises(EffectError, match="other than those"):
         twins.make("CartPole").extend(other)
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(EffectError, match="damaged"):
