@@ -114,7 +114,7 @@ def test_what_is_no_ensemble_no_file_of_one_or_too_few_data_is_refused(tmp_path)
         NeuralForce.load(tmp_path / "other.npz")
     with pytest.raises(EffectError, match="attach it"):
         NeuralForce().save(tmp_path / "nothing")
-    with pytest.raises(EffectError, match="members and units"):
+    with pytest.raises(EffectError, match="at least one member"):
         NeuralForce(n_members=0)
     twin = twins.make("Pendulum")
     with pytest.raises(CalibrationError, match="too few"):
