@@ -6,7 +6,13 @@ import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.errors import first_names
-from sb3_hds.twins.mujoco.parameters import bodies_of, compensated, gravity_of, random_positions
+from sb3_hds.twins.mujoco.parameters import (
+    bodies_of,
+    compensated,
+    gravity_of,
+    of_body,
+    random_positions,
+)
 from sb3_hds.twins.mujoco.rigid_body.dynamics import Tree, configuration, inverse_dynamics
 
 if TYPE_CHECKING:
@@ -57,10 +63,8 @@ def unidentifiable(twin: "MechanismTwin") -> str:
 def inertial(twin: "MechanismTwin") -> list[str]:
     """:return: names of the parameters of masses and inertias"""
     mechanism = twin.mechanism
-    bodies = [link.body.name for link in mechanism.links if link.body]
-    ends = ["mass", *(f"com_{x}" for x in "xyz"), *(f"stretch_{x}" for x in "xyz")]
-    ends += ["shear_xy", "shear_xz", "shear_yz"]
-    found = [f"{body}_{end}" for body in bodies for end in ends]
+    bodies = [link.body for link in mechanism.links if link.body]
+    found = [name for body in bodies for name in of_body(body)]
     found += [f"{link.joint}_armature" for link in mechanism.links]
     return [name for name in found if name in twin.parameters]
 

@@ -67,7 +67,7 @@ def of_plant(
             found[f"{payload.name}_payload_{axis}"] = Parameter(0.0, _NEAR, "m")
     if masses:
         for body in moving:
-            found |= _of_body(body)
+            found |= of_body(body)
     return found
 
 
@@ -140,8 +140,8 @@ def _of_drive(drive: Drive, link: Link) -> dict[str, Parameter]:
     }
 
 
-def _of_body(body: Body) -> dict[str, Parameter]:
-    """Parameters whose values are all physical: a positive mass, and a realizable inertia."""
+def of_body(body: Body) -> dict[str, Parameter]:
+    """:return: mass, centre and inertia; any values are physically consistent"""
     found = {f"{body.name}_mass": Parameter(body.mass, 0.1 * body.mass, "kg", 1e-3 * body.mass)}
     for axis, value in zip(_AXES, centre_in_body(body), strict=True):
         found[f"{body.name}_com_{axis}"] = Parameter(value, _SHIFT, "m")

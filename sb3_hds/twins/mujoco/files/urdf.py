@@ -16,6 +16,7 @@ from sb3_hds.twins.mujoco.files.correction import (
     in_body_frame,
 )
 from sb3_hds.twins.mujoco.mechanism import Body, Link
+from sb3_hds.twins.mujoco.parameters import of_body
 from sb3_hds.twins.mujoco.rigid_body import spatial
 
 
@@ -43,20 +44,12 @@ def urdf_of(correction: Correction, source: Any) -> str:
         body = correction.mechanism.links[i].body
         assert body is not None
         _write_urdf_inertial(correction, links.get(body.name), body, new)
-    in_file = {
-        f"{link.joint}_{name}" for link in correction.mechanism.links for name in OF_JOINTS[:2]
-    }
-    inertial = correction.plant.masses or correction.plant.payload is not None
-    bodies = (
-        [link.body.name for link in correction.mechanism.links if link.body] if inertial else []
-    )
-    ends = ("_mass", "_com_", "_stretch_", "_shear_")
-    in_bodies = {
-        n for n in correction.values for b in bodies for e in ends if n.startswith(f"{b}{e}")
-    }
-    in_bodies |= {name for name in correction.values if "_payload" in name}
+    recorded = {name for name in correction.values if "_payload" in name}
+    for link in correction.mechanism.links:
+        recorded |= {f"{link.joint}_{name}" for name in OF_JOINTS[:2]}
+        recorded |= set(of_body(link.body) if link.body else ())
     for name in correction.values:
-        if correction.difference(name) and name not in in_file | in_bodies:
+        if correction.difference(name) and name not in recorded:
             correction.record_left_out(name)
     for _, _, key, own in correction.effects:
         correction.record_effect(key, own, written=False)
