@@ -84,8 +84,8 @@ def _integrator(model: Any, wanted: str | None) -> str:
     found = integrator_of(model) if wanted is None else str(wanted).lower()
     if found not in ("euler", "implicitfast", "rk4"):
         raise ParameterError(
-            f"The integrator '{found}' is not supported: pass integrator='implicitfast', 'euler' or "
-            "'rk4'."
+            f"The integrator '{found}' is not supported: pass integrator='implicitfast', 'euler' "
+            "or 'rk4'."
         )
     return found
 
