@@ -131,26 +131,3 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             f"'{source}' is damaged or was not written by Trajectories.save ({reason}). "
             "Restore it from a copy, or record it again."
         ) from error
-
-
-def read_marked(path: str | os.PathLike[str], kind: str, version: int) -> dict[str, np.ndarray]:
-    """
-    :param path: as given to :func:`write_npz`
-    :param kind: value that ``format`` must have in the file
-    :param version: the latest version that can be read
-    :return: all arrays, by name
-    :raises TrajectoryError: as :func:`read_npz`, and for another format or a later version
-    """
-    stored = read_npz(path)
-    if stored.get("format", np.array("")).tolist() != kind:
-        raise TrajectoryError(
-            f"'{path}' was not written by Trajectories.save; it holds: {', '.join(stored)}. "
-            "Say what that is, columns={'time': NAME, 'obs': [NAME, ...], 'actions': [NAME, "
-            "...]}, or build the data with Trajectories.from_arrays."
-        )
-    if stored.get("version", np.array(0)) > version:
-        raise TrajectoryError(
-            f"'{path}' is of version {stored['version']}, this sb3_hds reads up to "
-            f"{version}. Upgrade sb3_hds."
-        )
-    return stored

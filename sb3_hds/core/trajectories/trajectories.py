@@ -22,7 +22,7 @@ from sb3_hds.core.trajectories.episodes import (
     same_interval,
 )
 from sb3_hds.core.trajectories.replay_buffer import episodes_in
-from sb3_hds.core.trajectories.storage import log_reader, read_marked, write_npz
+from sb3_hds.core.trajectories.storage import log_reader, read_npz, write_npz
 from sb3_hds.errors import TrajectoryError
 
 _FORMAT, _VERSION = "sb3_hds.Trajectories", 1
@@ -191,7 +191,18 @@ class Trajectories:
     @classmethod
     def _load_npz(cls, path: str | os.PathLike[str]) -> "Trajectories":
         """One file that :meth:`save` wrote."""
-        stored = read_marked(path, _FORMAT, _VERSION)
+        stored = read_npz(path)
+        if stored.get("format", np.array("")).tolist() != _FORMAT:
+            raise TrajectoryError(
+                f"'{path}' was not written by Trajectories.save; it holds: {', '.join(stored)}. "
+                "Say what that is, columns={'time': NAME, 'obs': [NAME, ...], 'actions': [NAME, "
+                "...]}, or build the data with Trajectories.from_arrays."
+            )
+        if stored.get("version", np.array(0)) > _VERSION:
+            raise TrajectoryError(
+                f"'{path}' is of version {stored['version']}, this sb3_hds reads up to "
+                f"{_VERSION}. Upgrade sb3_hds."
+            )
         try:
             lengths = stored["lengths"].tolist()
             obs = [x[: n + 1] for x, n in zip(stored["obs"], lengths, strict=True)]
