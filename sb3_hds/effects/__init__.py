@@ -11,6 +11,7 @@ from sb3_hds.effects.actuator import (
     Saturation,
     TorqueGain,
 )
+from sb3_hds.effects.flexible import ClearanceSpring, Hysteresis
 from sb3_hds.effects.joint import (
     ConcaveFriction,
     CoulombFriction,
@@ -22,7 +23,6 @@ from sb3_hds.effects.joint import (
     StribeckFriction,
     ViscousFriction,
 )
-from sb3_hds.effects.nameless import ClearanceSpring, Hysteresis
 from sb3_hds.effects.neural import NeuralForce, force_of
 from sb3_hds.effects.position import Cogging, ConstantForce, CubicStiffness, Stiffness
 from sb3_hds.effects.sensor import SensorBias, SensorDelay, SensorScale, SignFlip, reversed_joint
