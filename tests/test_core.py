@@ -218,7 +218,7 @@ def test_effects_attach_to_the_plant_below_the_wrapper(x64):
     state = outside.infer(jnp.zeros(2), outside.params)
     after = outside.step(state, jnp.full(1, 0.1), outside.params)
     assert float(after.v[0]) == pytest.approx(0.1 * (0.2 - 0.05), rel=1e-12)
-    with pytest.raises(EffectError, match=re.escape("Use twin.extend(*effects), which attaches")):
+    with pytest.raises(EffectError, match=re.escape("Use twin.extend(*effects), which does that")):
         ExtendedTwin(behind(action=wrapper), DeadZone())
 
 

@@ -71,7 +71,7 @@ def test_the_whole_catalogue_at_null_changes_nothing(x64):
 
 GROUPS = {
     slot: [effect for effect in ENTRIES if effect.__module__.endswith(slot)]
-    for slot in ("joint", "position", "nameless", "transmission", "actuator", "sensor")
+    for slot in ("joint", "position", "flexible", "transmission", "actuator", "sensor")
 }
 # The limit hides how commands came about.
 GROUPS["actuator"].remove(effects.Saturation)
