@@ -1,9 +1,9 @@
-# ruff: noqa: F401  what editors know of names that are imported on first use
+# ruff: noqa: F401  imports for type checkers of names that are imported on first use
 """
 Learn through a differentiable simulation of your environment, and find out what it gets wrong.
 
-Names are imported on first use: importing the package imports neither jax nor torch. It registers
-our environments with Gymnasium.
+Importing the package registers its environments with Gymnasium. It imports neither jax nor torch:
+names are imported on first use.
 """
 
 import importlib

@@ -1,12 +1,12 @@
-"""Errors raised on purpose: each message says what was expected, what came, and the way out."""
+"""Exceptions: each message says what was expected, what was found, and what to do about it."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 
 class SB3HDSError(Exception):
-    """Base of every error below."""
+    """Base class of all exceptions of this package."""
 
 
 class NoTwinError(SB3HDSError, LookupError):
@@ -14,7 +14,7 @@ class NoTwinError(SB3HDSError, LookupError):
 
 
 class TwinError(SB3HDSError, ValueError):
-    """A twin does not keep the contract: a declaration, or what a method returns, is wrong."""
+    """A declaration of a twin, or a return value of one of its methods, is wrong."""
 
 
 class ParameterError(SB3HDSError, ValueError):
@@ -22,7 +22,7 @@ class ParameterError(SB3HDSError, ValueError):
 
 
 class ModelFileError(SB3HDSError, ValueError):
-    """The model file of a robot cannot be read, or asks for what its twin cannot simulate."""
+    """A robot's model file cannot be read, or has features that its twin cannot simulate."""
 
 
 class EffectError(SB3HDSError, ValueError):
@@ -38,44 +38,44 @@ class CalibrationError(SB3HDSError, ValueError):
 
 
 class RewardError(SB3HDSError, ValueError):
-    """A reward gives planning nothing to climb."""
+    """A reward has no gradient for planning."""
 
 
 class EnvironmentMismatchError(SB3HDSError, ValueError, AssertionError):
     """
-    An environment, as wrapped, is not what its twin simulates, or what an algorithm takes.
+    An environment or its wrappers do not match the twin or the algorithm.
 
-    It is an ``AssertionError``, too, because that is what SB3 raises for spaces that do not fit.
+    It is an ``AssertionError``, too, because SB3 raises that for unsupported spaces.
     """
 
 
 class SafetyError(SB3HDSError, RuntimeError):
-    """A safety layer cannot keep what it promises: what it assumes does not hold."""
+    """An assumption of a safety layer does not hold, so it cannot guarantee safety."""
 
 
 class ExportError(SB3HDSError, ValueError):
-    """A policy cannot be exported, or a file that was exported cannot be run."""
+    """A policy cannot be exported, or an exported file cannot be run."""
 
 
 class StudyError(SB3HDSError, ValueError):
-    """A study asks for what does not exist, or for a folder that is taken."""
+    """A study names something that does not exist, or a folder that is in use."""
 
 
 class DivergedError(SB3HDSError, FloatingPointError, ValueError):
     """
     Learning diverged.
 
-    It is a ``ValueError``, too, because RL Zoo gives up one trial of a search for that, and the
-    whole search for other errors.
+    It is a ``ValueError``, too, because RL Zoo ends only the trial of a search for that, and the
+    search for other errors.
     """
 
 
 class SeedsDivergedError(DivergedError):
     """
-    Some of several seeds that learned side by side diverged.
+    Some of several seeds that were trained in parallel diverged.
 
-    :param models: by their seeds, of those that did not
-    :param episodes: of the same, what :func:`~sb3_hds.algos.learn_compiled` returns
+    :param models: by seed, those that did not diverge
+    :param episodes: by seed, their return value of :func:`~sb3_hds.algos.learn_compiled`
     """
 
     def __init__(self, message: str, models: dict[int, Any], episodes: dict[int, Any]) -> None:
@@ -85,8 +85,14 @@ class SeedsDivergedError(DivergedError):
 
 def did_you_mean(name: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
     """
-    :param cutoff: how like each other two names must be, of ``difflib``, in [0, 1]
-    :return: to end a message with: a question, after a space, or nothing, if no name is close
+    :param cutoff: least similarity of two names by ``difflib``, in [0, 1]
+    :return: a question for the end of a message, after a space; empty if no name is close
     """
     close = difflib.get_close_matches(name, list(known), 1, cutoff)
     return f" Did you mean '{close[0]}'?" if close else ""
+
+
+def first_names(names: Sequence[str], n: int = 3) -> str:
+    """:return: the first ``n`` names, and how many more there are"""
+    more = f" and {len(names) - n} more" if len(names) > n else ""
+    return ", ".join(names[:n]) + more

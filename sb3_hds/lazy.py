@@ -1,18 +1,20 @@
 """Packages whose names are imported on first use."""
 
+import builtins
+import contextlib
 import importlib
 import importlib.util
 import sys
 import threading
-from collections.abc import Iterable, Mapping
-from types import ModuleType
+from collections.abc import Iterator, Mapping
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 
 class _Package(ModuleType):
     """
-    A public name may be that of a submodule, too (``data.audit``): it stays what it stands for
-    when the submodule is imported, which Python would put in its place.
+    A package with lazily imported names. If a public name is also that of a submodule
+    (``data.audit``), importing the submodule does not replace it, as it would in Python.
     """
 
     _public: Mapping[str, str]
@@ -32,25 +34,42 @@ class _Package(ModuleType):
         return sorted(self._public)
 
 
-def lazily(package: str, public: Mapping[str, Iterable[str]]) -> None:
+@contextlib.contextmanager
+def lazy_imports(package: str) -> Iterator[None]:
     """
-    Called at the end of a package's ``__init__``.
+    Postpone the imports in a ``with`` block of a package's ``__init__``: ``from M import A`` there
+    imports ``M`` when ``A`` is first used.
 
     :param package: its name
-    :param public: names, by the module that they are imported from: below the package, or with
-        its whole name, which begins with ``sb3_hds``
     """
     module: Any = sys.modules[package]
-    homes = {
-        home if home.startswith("sb3_hds.") else f"{package}.{home}": names
-        for home, names in public.items()
-    }
-    module.__dict__["_public"] = {name: home for home, names in homes.items() for name in names}
+    homes: dict[str, str] = {}
+
+    def record(name: str, *arguments: Any, **keywords: Any) -> Any:
+        if not (arguments and arguments[0] is module.__dict__):  # of another module, in a thread
+            return usual(name, *arguments, **keywords)
+        names = arguments[2]
+        homes.update(dict.fromkeys(names, name))
+        return SimpleNamespace(**dict.fromkeys(names))
+
+    with _patching:
+        usual, builtins.__import__ = builtins.__import__, record
+        try:
+            yield
+        finally:
+            builtins.__import__ = usual
+    for name in homes:
+        del module.__dict__[name]
+    module.__dict__["_public"] = homes
     module.__class__ = _Package
 
 
+# Two locks: what runs under the second one may import packages that need the first one.
+_patching, _one_at_a_time = threading.RLock(), threading.RLock()
+
+
 class _Postponed(ModuleType):
-    """A package whose ``__init__`` runs when a name is asked for that its submodules are not."""
+    """A package whose ``__init__`` runs when a name other than a submodule's is first used."""
 
     def __getattr__(self, name: str) -> Any:
         spec: Any = self.__spec__
@@ -68,14 +87,10 @@ class _Postponed(ModuleType):
         raise AttributeError(f"module '{self.__name__}' has no attribute '{name}'")
 
 
-_one_at_a_time = threading.RLock()
-
-
 def postpone(package: str) -> None:
     """
-    Let submodules of a package be imported without all that its ``__init__`` imports, which runs
-    when one of the package's own names is first asked for. Nothing happens where it has run, or
-    where there is no such package.
+    Allow to import submodules of a package without running its ``__init__``, which runs when one of
+    the package's own names is first used. No effect if it has run, or without such a package.
 
     :param package: its name
     """

@@ -154,7 +154,7 @@ def test_the_derivative_of_a_solution_is_the_implicit_one(x64):
 
 def test_a_least_pivot_replaces_a_negative_one_and_leaves_good_ones(x64):
     indefinite, right = jnp.diag(jnp.array([2.0, -1.0])), jnp.ones(2)
-    np.testing.assert_allclose(solve_spd(indefinite, right, least_pivot=0.1), [0.5, 10.0])
+    np.testing.assert_allclose(solve_spd(indefinite, right, min_pivot=0.1), [0.5, 10.0])
 
 
 def test_the_inertia_of_a_joint_is_what_a_force_there_accelerates(x64):
@@ -218,7 +218,7 @@ def test_effects_attach_to_the_plant_below_the_wrapper(x64):
     state = outside.infer(jnp.zeros(2), outside.params)
     after = outside.step(state, jnp.full(1, 0.1), outside.params)
     assert float(after.v[0]) == pytest.approx(0.1 * (0.2 - 0.05), rel=1e-12)
-    with pytest.raises(EffectError, match=re.escape("Use twin.extend(*effects), which attaches")):
+    with pytest.raises(EffectError, match=re.escape("Use twin.extend(*effects), which does that")):
         ExtendedTwin(behind(action=wrapper), DeadZone())
 
 

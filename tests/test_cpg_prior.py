@@ -230,7 +230,7 @@ def test_an_environment_says_whether_its_actions_are_positions():
     (swimmer, {"omega_swing": 0.0}, "omega_swing must be above 0"),
     (swimmer, {"amplitude": [1.0, 2.0, 3.0]}, "3 values of amplitude"),
     (swimmer, {"kp": np.nan}, "kp must be finite"),
-    (swimmer, {"frequency_factor": (0.0, 1.0)}, "0 <= lowest < highest"),
+    (swimmer, {"frequency_factor": (0.0, 1.0)}, "0 < smallest < largest"),
     (pendulum, {"control": "track"}, "needs an environment of MuJoCo"),
     (pendulum, {"control": "direct", "position": [0], "velocity": [2]}, "tracks no joints"),
     (pendulum, {"position": [0]}, "as many as positions"),

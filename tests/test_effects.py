@@ -71,7 +71,7 @@ def test_the_whole_catalogue_at_null_changes_nothing(x64):
 
 GROUPS = {
     slot: [effect for effect in ENTRIES if effect.__module__.endswith(slot)]
-    for slot in ("joint", "position", "nameless", "transmission", "actuator", "sensor")
+    for slot in ("joint", "position", "flexible", "transmission", "actuator", "sensor")
 }
 # The limit hides how commands came about.
 GROUPS["actuator"].remove(effects.Saturation)
@@ -166,7 +166,7 @@ def test_an_effect_is_attached_once_by_name_or_index_and_survives_its_spec(effec
     assert back == twin and hash(back) == hash(twin) and back.params == twin.params
     assert plain.extend(effect(place)).to_spec() == plain.extend(effect(0)).to_spec()
     for attach in (lambda: plain.extend(effect(0), effect(place)), lambda: twin.extend(effect(0))):
-        with pytest.raises(EffectError, match=f"once at each place; {effect.name}.{place} came"):
+        with pytest.raises(EffectError, match=f"once at each place; {effect.name}.{place} was"):
             attach()
 
 

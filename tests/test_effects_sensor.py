@@ -64,7 +64,7 @@ def test_what_flips_cannot_say_is_refused():
         def observe(self, state, params):
             return jnp.concatenate([state.q + 1.0, state.v])
 
-    with pytest.raises(EffectError, match="rail round changes more than the sign of: position"):
+    with pytest.raises(EffectError, match="Reversing rail changes more than the sign of: position"):
         reversed_joint(Slope(), "rail")
     with pytest.raises(EffectError, match=r"no joint 'hinge'. It has: rail"):
         reversed_joint(Mass(), "hinge")

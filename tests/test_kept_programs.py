@@ -11,8 +11,8 @@ import jax
 import pytest
 from cases import each
 
-from sb3_hds.core.numerics import kept_programs
-from sb3_hds.core.numerics.kept_programs import Programs, keep_programs
+from sb3_hds.core.numerics import compilation
+from sb3_hds.core.numerics.compilation import Programs, keep_programs
 
 SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 OF_USERS = ("JAX_COMPILATION_CACHE_DIR", "SB3_HDS_CACHE", "XDG_CACHE_HOME")
@@ -30,7 +30,7 @@ print(json.dumps([counts["cache_hits"], counts["cache_misses"]]))
 #: a program of JAX's own comes first: what is compiled earlier does not keep the cache off
 PLAIN = """
 jax.numpy.zeros(3).block_until_ready()
-from sb3_hds.core.numerics.kept_programs import keep_programs
+from sb3_hds.core.numerics.compilation import keep_programs
 keep_programs()
 assert jax.jit(lambda x: 2.0 * x + 1.0)(3.0) == 7.0
 """
@@ -118,11 +118,11 @@ def test_with_an_unknown_cache_of_jax_nothing_is_cached(fresh_settings, monkeypa
 
     monkeypatch.setenv("SB3_HDS_CACHE", str(tmp_path))
     monkeypatch.delattr(compilation_cache, "get_file_cache")
-    kept_programs._offered.cache_clear()
+    compilation._hook_into_jax.cache_clear()
     try:
         assert keep_programs() is None
     finally:
-        kept_programs._offered.cache_clear()
+        compilation._hook_into_jax.cache_clear()
     assert jax.config.values["jax_compilation_cache_dir"] is None
 
 
@@ -164,7 +164,7 @@ def test_what_is_not_as_it_was_written_is_not_there(damage, tmp_path):
 
 
 def test_programs_that_were_not_used_for_longest_make_room(tmp_path):
-    programs = Programs(tmp_path, most=300)
+    programs = Programs(tmp_path, max_size=300)
     now = time.time()
     for i in range(3):
         programs.put(f"program_{i}", bytes([i]) * 100)
@@ -172,7 +172,7 @@ def test_programs_that_were_not_used_for_longest_make_room(tmp_path):
         os.utime(path, (now - 100 + i, now - 100 + i))
     assert programs.get("program_0") == bytes(100)
 
-    Programs(tmp_path, most=300).put("program_3", b"3" * 100)
+    Programs(tmp_path, max_size=300).put("program_3", b"3" * 100)
 
     kept = [i for i in range(4) if programs.get(f"program_{i}") is not None]
     assert kept == [0, 3]
@@ -193,14 +193,14 @@ def test_what_a_process_left_unfinished_goes_when_it_is_old(tmp_path):
 def test_processors_with_other_instructions_do_not_share_programs(monkeypatch, tmp_path):
     programs = Programs(tmp_path)
     programs.put("key", b"for this one")
-    monkeypatch.setattr(kept_programs, "_processor", lambda: "another")
+    monkeypatch.setattr(compilation, "_processor", lambda: "another")
 
     assert programs.get("key") is None
 
 
 WRITES = """
 import sys, pathlib
-from sb3_hds.core.numerics.kept_programs import Programs
+from sb3_hds.core.numerics.compilation import Programs
 programs = Programs(pathlib.Path(sys.argv[1]))
 for _ in range(200):
     programs.put("key", sys.argv[2].encode() * 300_000)

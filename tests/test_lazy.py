@@ -1,5 +1,6 @@
 """What is imported when."""
 
+import builtins
 import importlib
 import subprocess
 import sys
@@ -7,7 +8,7 @@ import threading
 
 import pytest
 
-from sb3_hds.lazy import postpone
+from sb3_hds.lazy import lazy_imports, postpone
 
 INIT = "import builtins\nbuiltins.runs_of_it.append(1)\nfrom {name}.part import VALUE\nOWN = 1\n"
 #: nobody who makes a model, and learns in an exact twin, needs these
@@ -43,8 +44,6 @@ def package(tmp_path, monkeypatch, request):
 
 
 def runs() -> int:
-    import builtins
-
     return len(builtins.runs_of_it)  # type: ignore[attr-defined]
 
 
@@ -94,6 +93,32 @@ def test_threads_that_read_at_the_same_time_find_it_complete(package):
         thread.join()
 
     assert found == [2] * 4 and runs() == 1
+
+
+def test_imports_in_a_block_are_made_on_first_use_of_their_names(package):
+    """``part`` is the name of a submodule and of something in it."""
+    name, usual = package.name, builtins.__import__
+    (package / "__init__.py").write_text(
+        f"from sb3_hds.lazy import lazy_imports\n"
+        f"with lazy_imports(__name__):\n    from {name}.part import VALUE, part\n"
+    )
+    (package / "part.py").write_text("VALUE, part = 3, 'a name'\n")
+
+    module = importlib.import_module(name)
+
+    assert builtins.__import__ is usual and f"{name}.part" not in sys.modules
+    assert module.VALUE == 3 and f"{name}.part" in sys.modules
+    assert module.part == "a name" and dir(module) == ["VALUE", "part"]
+    with pytest.raises(AttributeError, match="no attribute 'missing'"):
+        _ = module.missing
+
+
+def test_other_modules_import_as_usual_during_a_block(package):
+    module = importlib.import_module(package.name)
+    with lazy_imports(package.name):
+        assert __import__("json", fromlist=["dumps"]).dumps(1) == "1"
+
+    assert builtins.__import__.__name__ == "__import__" and dir(module) == []
 
 
 def test_what_is_not_there_is_not_put_there():

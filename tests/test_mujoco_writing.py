@@ -58,7 +58,7 @@ def test_joints_gains_gravity_and_payload_of_a_twin_are_those_of_the_file(tmp_pa
 
 
 def test_masses_centres_and_inertias_are_those_of_the_file(tmp_path):
-    with pytest.warns(UserWarning, match="no data tell"):
+    with pytest.warns(UserWarning, match="no data can identify"):
         twin = twins.from_mujoco(robots.GRIPPER, masses=True)
     left = {"left_mass": 0.2, "left_com_x": 0.004, "left_stretch_y": 0.3, "left_shear_xz": 0.2}
 
@@ -103,7 +103,7 @@ def test_actuators_that_a_urdf_does_not_have_are_in_the_file(tmp_path):
 
 
 def test_a_urdf_is_corrected_where_it_can_say_it(tmp_path):
-    with pytest.warns(UserWarning, match="no data tell"):
+    with pytest.warns(UserWarning, match="no data can identify"):
         twin = twins.from_mujoco(robots.URDF, masses=True)
     values = {"shoulder_damping": 0.5, "elbow_frictionloss": 0.25, "elbow_armature": 0.01}
     path = tmp_path / "robot.urdf"

@@ -110,7 +110,7 @@ def test_what_is_added_is_known_everywhere(tmp_path):
     insert(
         twins / "__init__.py",
         ("Written, from_mujoco, write_model, write_models\n", IMPORT),
-        ("for _twin in (\n", "    HeavyAxis,\n"),
+        ("__all__ = [\n", '    "HeavyAxis",\n'),
     )
 
     command = (sys.executable, "-c", USE, ROOT / "tests", tmp_path)

@@ -160,7 +160,7 @@ def test_a_rig_is_pushed_as_hard_as_it_was():
 @each(
     ("LinearAxis", {"observe": "v"}, "can observe 'q' or 'qv', got 'v'"),
     ("CartPole", {"observe": "v"}, "'task' or 'q' or 'qv'"),
-    ("FreePendulum", {"zero": "left"}, "'down' or 'up'"),
+    ("FreePendulum", {"zero": "left"}, "'down', 'up'"),
     ("FreePendulum", {"tip": 0.0}, "tip of FreePendulum must be a length above 0 m, got 0"),
     ("DoublePendulum", {"driven": "none"}, "'both', 'first', 'second'"),
     ("ServoPendulum", {"commands": "torque"}, "'goal', 'goal, enable'"),

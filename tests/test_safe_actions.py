@@ -306,7 +306,7 @@ FORWARD = {"action_space": spaces.Box(1.0, 5.0, (2,))}
     (barrier, {"low": -4.0, "position": [[0, 1], [1, 0]]}, "half a turn"),
     (barrier, {"tolerance": 0.6}, "more than 2.4"),
     (barrier, {"on_breach": "pray"}, "on_breach must be one of"),
-    (barrier, FORWARD, "zero and of either sign"),
+    (barrier, FORWARD, "speeds of either sign"),
     (ActionShield, {"constraints": ([[1.0, 0.0, 0.0]], [1.0])}, "of shape"),
     (ActionShield, {"constraints": ([[1.0, 0.0], [-1.0, 0.0]], [-1.0] * 2)}, "no command"),
     (ActionShield, {"constraints": "nowhere.at_all"}, "no function"),

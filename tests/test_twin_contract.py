@@ -79,7 +79,7 @@ FORGETFUL = {"initial": clocked, "step": lambda self, state, u, p: state._replac
     ({"bias": lambda self, q, v, p: p["mass"] * q}, "'mass'. Its parameters are: inertia."),
     ({"bias": lambda self, q, v, p: q @ jnp.ones((2, 2))}, "TypeError (test_twin_contract.py"),
     ({"bias": lambda self, q, v, p: q if q[0] > 0 else -q}, "Replace `if` on an array by"),
-    ({"bias": lambda self, q, v, p: np.asarray(q)}, "Use jax.numpy in place of numpy"),
+    ({"bias": lambda self, q, v, p: np.asarray(q)}, "Use jax.numpy instead of numpy"),
     ({"joints": Joint("hip")}, "Write joints = (Joint(...),), with"),
     ({"joints": (Joint("hip"),) * 3}, "Leg has joints of the same name: hip"),
     ({"actuators": (Actuator("motor", "N m", 1.0, -1.0),)}, "in Leg must be low < high"),

@@ -1,15 +1,14 @@
 """
 The pure JAX core: parameters, effects, twins and data.
 
-Names are imported on first use: a loop on a robot needs few of them, and neither JAX nor PyTorch.
+Names are imported on first use, so that a control loop on a robot needs neither JAX nor PyTorch.
 """
 
-from typing import TYPE_CHECKING
+from sb3_hds.lazy import lazy_imports
 
-from sb3_hds.lazy import lazily
-
-if TYPE_CHECKING:
+with lazy_imports(__name__):
     from sb3_hds.core.analytic import AnalyticTwin
+    from sb3_hds.core.declarations import Actuator, Channel, Joint, Parameter
     from sb3_hds.core.effect import (
         ActionEffect,
         Effect,
@@ -24,11 +23,15 @@ if TYPE_CHECKING:
     from sb3_hds.core.extended import ExtendedTwin
     from sb3_hds.core.numerics.integrators import explicit_euler, rk4, semi_implicit_euler
     from sb3_hds.core.numerics.linear import solve_spd
-    from sb3_hds.core.parameter import Parameter
     from sb3_hds.core.rollout import Rollout, rollout, rollout_policy
-    from sb3_hds.core.signals import Actuator, Channel, Joint
     from sb3_hds.core.trajectories import Trajectories
-    from sb3_hds.core.transformed import TransformedTwin, seen_through
+    from sb3_hds.core.transformed import (
+        TRANSFORMS,
+        TransformedTwin,
+        seen_through,
+        transform_from_spec,
+        transform_to_spec,
+    )
     from sb3_hds.core.transforms.barrier import Barrier
     from sb3_hds.core.transforms.base import (
         ActionTransform,
@@ -36,11 +39,9 @@ if TYPE_CHECKING:
         Signals,
         StatefulTransform,
     )
-    from sb3_hds.core.transforms.continuity import Continuity
     from sb3_hds.core.transforms.cpg import Rhythm
-    from sb3_hds.core.transforms.filters import Delay, LowPass, RateLimit, Scale
+    from sb3_hds.core.transforms.filters import Continuity, Delay, LowPass, RateLimit, Scale
     from sb3_hds.core.transforms.history import History
-    from sb3_hds.core.transforms.registry import TRANSFORMS, transform_from_spec, transform_to_spec
     from sb3_hds.core.transforms.rescale import RescaleAction, RescaleObservation
     from sb3_hds.core.twin import State, Twin
     from sb3_hds.core.types import (
@@ -117,57 +118,3 @@ __all__ = [
     "transform_from_spec",
     "transform_to_spec",
 ]
-
-lazily(
-    __name__,
-    {
-        "analytic": ("AnalyticTwin",),
-        "effect": (
-            "ActionEffect",
-            "Effect",
-            "ForceEffect",
-            "JointEffect",
-            "JointMoment",
-            "Moment",
-            "Ranges",
-            "SensorEffect",
-        ),
-        "effect_chain": ("EffectChain", "NO_EFFECTS"),
-        "extended": ("ExtendedTwin",),
-        "numerics.integrators": ("explicit_euler", "rk4", "semi_implicit_euler"),
-        "numerics.linear": ("solve_spd",),
-        "parameter": ("Parameter",),
-        "rollout": ("Rollout", "rollout", "rollout_policy"),
-        "signals": ("Actuator", "Channel", "Joint"),
-        "trajectories": ("Trajectories",),
-        "transformed": ("TransformedTwin", "seen_through"),
-        "transforms.barrier": ("Barrier",),
-        "transforms.base": (
-            "ActionTransform",
-            "ObservationTransform",
-            "Signals",
-            "StatefulTransform",
-        ),
-        "transforms.continuity": ("Continuity",),
-        "transforms.cpg": ("Rhythm",),
-        "transforms.filters": ("Delay", "LowPass", "RateLimit", "Scale"),
-        "transforms.history": ("History",),
-        "transforms.registry": ("TRANSFORMS", "transform_from_spec", "transform_to_spec"),
-        "transforms.rescale": ("RescaleAction", "RescaleObservation"),
-        "twin": ("State", "Twin"),
-        "types": (
-            "Action",
-            "Coordinates",
-            "Flag",
-            "Force",
-            "MassMatrix",
-            "Memory",
-            "Obs",
-            "Params",
-            "Position",
-            "Scalar",
-            "Tangent",
-            "Velocity",
-        ),
-    },
-)

@@ -1,4 +1,4 @@
-"""A twin of which several are possible, which is again a twin."""
+"""A twin with uncertain parameters."""
 
 import json
 import os
@@ -15,30 +15,29 @@ from sb3_hds.core.effect import Effect
 from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
 from sb3_hds.core.trajectories.storage import check_target, write_bytes
 from sb3_hds.core.twin import Layer, State, Twin
-from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar
+from sb3_hds.core.types import Action, Obs, Params
 from sb3_hds.errors import ParameterError
 
-#: under which the state remembers its draw, and the tensor that holds all of them
+# Key of an episode's draw in the state's memory, and of all draws in the tensors.
 _DRAW, _DRAWS = "belief", "belief.draws"
 
 
 class BeliefTwin(Layer):
     """
-    Equally likely parameter vectors of one twin. Each episode has its own: it is drawn where the
-    episode begins (:meth:`initial`), and stays in the state's memory. Planning, learning and
-    environments need not know of it: every rollout, and every environment until its next reset, is
-    under one draw.
+    Equally likely parameter vectors of one twin. :meth:`initial` draws one, and it stays in the
+    state's memory: every rollout, and every environment until its next reset, simulates one draw.
+    Planning, learning and environments need no change.
 
-    A state that is inferred from an observation is under draw 0, the best single guess. What is the
-    same in all draws is a parameter as of any twin; what differs is in the draws alone.
+    A state that is inferred from an observation gets draw 0, the best single estimate. Parameters
+    that are equal in all draws are those of the twin; the others are in the draws only.
 
-    :param base: the twin with everything that any draw has
-    :param draws: by row, the parameters in the order of ``base.parameters``, shape ``(n, p)``; the
-        first is the best single guess
-    :param origin: number of the answer that each draw comes from, shape ``(n,)``
-    :param answers: their names
-    :param weights: their shares, with the sum one
-    :raises ParameterError: for a wrong shape, a value that is not finite or out of its bounds
+    :param base: the twin with the effects of all draws
+    :param draws: one parameter vector per row, in the order of ``base.parameters``, shape
+        ``(n, p)``; the first is the best single estimate
+    :param origin: index of the answer that each draw comes from, shape ``(n,)``
+    :param answers: names of the answers of a diagnosis
+    :param weights: probabilities of the answers, with the sum one
+    :raises ParameterError: for a wrong shape, or a value that is not finite or out of bounds
     """
 
     def __init__(
@@ -60,39 +59,33 @@ class BeliefTwin(Layer):
         self.parameters = {name: base.parameters[name] for name in shared}
         self.values = {name: float(own[name][0]) for name in shared}
         self.known_parameters = base.known_parameters & frozenset(shared)
-        self._differing = (
-            np.stack([own[name] for name in self.varied], 1)
-            if self.varied
-            else (np.zeros((len(draws), 0)))
-        )
+        self._varied_draws = draws[:, [name in self.varied for name in own]]
         self.origin = origin
         self.answers, self.weights = tuple(answers), tuple(map(float, weights))
-        self.tensors = {**base.tensors, _DRAWS: jnp.asarray(self._differing, jnp.float32)}
+        self.tensors = {**base.tensors, _DRAWS: jnp.asarray(self._varied_draws, jnp.float32)}
 
     @property
     def n_draws(self) -> int:
-        """Their number."""
-        return len(self._differing)
+        """Number of draws."""
+        return len(self._varied_draws)
 
     @property
     def draws(self) -> Float[np.ndarray, "n p"]:
-        """All parameters by row, in the order of ``base.parameters``."""
-        own = dict(zip(self.varied, self._differing.T, strict=True))
-        same = np.ones(self.n_draws)
-        return np.stack(
-            [own.get(n, self.values.get(n, 0.0) * same) for n in self.base.parameters], 1
-        )
+        """All parameters, one vector per row, in the order of ``base.parameters``."""
+        own = dict(zip(self.varied, self._varied_draws.T, strict=True))
+        columns = [own.get(n, self.values.get(n)) for n in self.base.parameters]
+        return np.stack([np.broadcast_to(x, self.n_draws) for x in columns], 1)
 
     def member(self, i: int) -> Twin:
         """
-        :param i: number of a draw; 0: the best single guess
-        :return: the twin of that draw
+        :param i: index of a draw; 0: the best single estimate
+        :return: the twin with the parameters of that draw
         """
         values = zip(self.base.parameters, self.draws[i].tolist(), strict=True)
         return self.base.with_parameters(**dict(values))
 
     def __str__(self) -> str:
-        """The answers with their weights, and the parameters that differ between draws."""
+        """The answers with their weights, and quantiles of the parameters that vary."""
         lines = [f"Belief about {self.name}: {self.n_draws} draws"]
         lines += [
             f"  {weight:6.1%}  {answer}"
@@ -100,7 +93,7 @@ class BeliefTwin(Layer):
         ]
         if self.varied:
             lines.append(f"{'parameter':<38}{'best':>10}{'5 %':>10}{'95 %':>10}")
-        for name, column in zip(self.varied, self._differing.T, strict=True):
+        for name, column in zip(self.varied, self._varied_draws.T, strict=True):
             unit = self.base.parameters[name].unit
             low, high = np.quantile(column, [0.05, 0.95])
             lines.append(f"{name[-38:]:<38}{column[0]:>10.4g}{low:>10.4g}{high:>10.4g} {unit}")
@@ -108,11 +101,11 @@ class BeliefTwin(Layer):
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
-        Write the belief as plain data, for ``twins.from_spec`` and ``--twin``.
+        Write a JSON file for ``twins.from_spec`` and ``--twin``.
 
-        :param path: a file of that name is replaced as a whole
-        :return: its path
-        :raises OSError: if there is no folder to write it in
+        :param path: a file of that name is replaced
+        :return: the path
+        :raises OSError: if its folder does not exist
         """
         check_target(path)
         return write_bytes(path, (json.dumps({"twin": self.to_spec()}) + "\n").encode())
@@ -120,17 +113,17 @@ class BeliefTwin(Layer):
     def extend(self, *effects: Effect) -> "BeliefTwin":
         extended = self.base.extend(*effects)
         own = dict(zip(self.base.parameters, self.draws.T, strict=True))
-        same = np.ones(self.n_draws)
-        columns = [own.get(n, extended.values[n] * same) for n in extended.parameters]
-        return self._over(extended, np.stack(columns, 1))
+        columns = [own.get(n, extended.values[n]) for n in extended.parameters]
+        draws = np.stack([np.broadcast_to(x, self.n_draws) for x in columns], 1)
+        return self._with_base(extended, draws)
 
     def without(self, *keys: str) -> "BeliefTwin":
-        left = self.base.without(*keys)
-        names = list(self.base.parameters)
-        return self._over(left, self.draws[:, [names.index(n) for n in left.parameters]])
+        reduced = self.base.without(*keys)
+        kept = [name in reduced.parameters for name in self.base.parameters]
+        return self._with_base(reduced, self.draws[:, kept])
 
     def at_interval(self, dt: float, substeps: int) -> "BeliefTwin":
-        return self._over(self.base.at_interval(dt, substeps), self.draws)
+        return self._with_base(self.base.at_interval(dt, substeps), self.draws)
 
     def typical_forces(self) -> tuple[float, ...]:
         return self.base.typical_forces()
@@ -138,47 +131,31 @@ class BeliefTwin(Layer):
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         key, own = jax.random.split(key)
         draw = jax.random.randint(own, (), 0, len(params[_DRAWS]))
-        return self._under(draw, self.base.initial(key, self._params(draw, params)))
+        return self._with_draw(draw, self.base.initial(key, self._drawn_params(draw, params)))
 
     def infer(self, obs: Obs, params: Params) -> State:
         draw = jnp.zeros((), int)
-        return self._under(draw, self.base.infer(obs, self._params(draw, params)))
+        return self._with_draw(draw, self.base.infer(obs, self._drawn_params(draw, params)))
 
     def observe(self, state: State, params: Params) -> Obs:
-        return self.base.observe(*self._of(state, params))
+        return self.base.observe(self.inner_state(state), self.inner_params(state, params))
 
     def step(
         self, state: State, action: Action, params: Params, effects: EffectChain = NO_EFFECTS
     ) -> State:
-        inner, own = self._of(state, params)
-        after = self.base.step(inner, action, own, effects)
+        own = self.inner_params(state, params)
+        after = self.base.step(self.inner_state(state), action, own, effects)
         return after._replace(memory=after.memory | {_DRAW: state.memory[_DRAW]})
 
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        inner, own = self._of(state, params)
-        return self.base.reward(inner, action, self._of(next_state, params)[0], own)
-
-    def planning_reward(
-        self, state: State, action: Action, next_state: State, params: Params
-    ) -> Scalar:
-        inner, own = self._of(state, params)
-        return self.base.planning_reward(inner, action, self._of(next_state, params)[0], own)
-
-    def terminated(self, state: State, params: Params) -> Flag:
-        return self.base.terminated(*self._of(state, params))
-
-    def sketch(self, state: State, params: Params) -> Any:
-        return self.base.sketch(*self._of(state, params))
-
     def to_spec(self) -> dict[str, Any]:
-        told = {
+        belief = {
             "parameters": list(self.base.parameters),
             "draws": self.draws.tolist(),
             "origin": self.origin.tolist(),
             "answers": list(self.answers),
             "weights": list(self.weights),
         }
-        return self.base.with_parameters(**self.values).to_spec() | {"belief": told}
+        return self.base.with_parameters(**self.values).to_spec() | {"belief": belief}
 
     def structure(self) -> tuple[Any, ...]:
         return (type(self), self.base, self.varied)
@@ -186,40 +163,39 @@ class BeliefTwin(Layer):
     def __repr__(self) -> str:
         return f"BeliefTwin({self.base!r}, {self.n_draws} draws)"
 
-    def _over(self, base: Twin, draws: np.ndarray) -> "BeliefTwin":
+    def _with_base(self, base: Twin, draws: np.ndarray) -> "BeliefTwin":
         return BeliefTwin(base, draws, self.origin, self.answers, self.weights)
 
-    def _params(self, draw: Any, params: Params) -> Params:
+    def _drawn_params(self, draw: Any, params: Params) -> Params:
         own = params[_DRAWS][draw]
         drawn = {name: own[i] for i, name in enumerate(self.varied)}
         return {name: params[name] for name in (*self.values, *self.base.tensors)} | drawn
 
-    def _of(self, state: State, params: Params) -> tuple[State, Params]:
-        """The state as the twin below has it, and the parameters of its draw."""
-        memory = dict(state.memory)
-        draw = jax.lax.stop_gradient(memory.pop(_DRAW))
-        return state._replace(memory=memory), self._params(jnp.round(draw).astype(int), params)
+    def inner_state(self, state: State) -> State:
+        memory = {key: own for key, own in state.memory.items() if key != _DRAW}
+        return state._replace(memory=memory)
 
-    def _under(self, draw: Any, state: State) -> State:
+    def inner_params(self, state: State, params: Params) -> Params:
+        draw = jax.lax.stop_gradient(state.memory[_DRAW])
+        return self._drawn_params(jnp.round(draw).astype(int), params)
+
+    def _with_draw(self, draw: Any, state: State) -> State:
         return state._replace(memory=state.memory | {_DRAW: draw.astype(state.q.dtype)})
 
 
-def belief_over(base: Twin, told: Mapping[str, Any]) -> BeliefTwin:
+def belief_from_spec(base: Twin, spec: Mapping[str, Any]) -> BeliefTwin:
     """
-    :param told: what ``to_spec`` wrote as ``"belief"``
-    :raises ParameterError: for other parameters than the twin's, or impossible draws
+    :param spec: what ``to_spec`` wrote as ``"belief"``
+    :raises ParameterError: for other parameters than the twin's, or invalid draws
     """
-    names = list(base.parameters)
-    if sorted(told["parameters"]) != sorted(names):
+    names, stored = list(base.parameters), list(spec["parameters"])
+    if sorted(stored) != sorted(names):
         raise ParameterError(
-            f"The belief is about {', '.join(told['parameters'])}, and {base.name} has "
-            f"{', '.join(names)}: it belongs to another twin."
+            f"The belief is about {', '.join(stored)}, and {base.name} has {', '.join(names)}: it "
+            "belongs to another twin."
         )
-    order = [list(told["parameters"]).index(name) for name in names]
-    draws = np.asarray(told["draws"], float)
-    return BeliefTwin(
-        base, draws[:, order], np.asarray(told["origin"]), told["answers"], told["weights"]
-    )
+    draws = np.asarray(spec["draws"], float)[:, [stored.index(name) for name in names]]
+    return BeliefTwin(base, draws, np.asarray(spec["origin"]), spec["answers"], spec["weights"])
 
 
 def _check(
@@ -238,7 +214,7 @@ def _check(
     fits = origin.shape == (len(draws),) and len(answers) == len(weights)
     if not (fits and np.all((origin >= 0) & (origin < len(answers)))):
         raise ParameterError(
-            f"origin must be the number of one of {len(answers)} answers for each of "
+            f"origin must be the index of one of {len(answers)} answers for each of "
             f"{len(draws)} draws, got shape {origin.shape}."
         )
     for name, column in zip(names, draws.T, strict=True):

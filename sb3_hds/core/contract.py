@@ -14,26 +14,26 @@ import jax
 import jax.numpy as jnp
 
 from sb3_hds.core.analytic import AnalyticTwin
-from sb3_hds.core.signals import Actuator, Channel, Joint
+from sb3_hds.core.declarations import Actuator, Channel, Joint
 from sb3_hds.core.twin import State, Twin, layers_of
 from sb3_hds.errors import TwinError
 
 _SIGNALS = {"joints": Joint, "actuators": Actuator, "channels": Channel}
-_LONGEST = 200  # letters of another library's message
-_MOST_NAMED = 4
-_WAYS_OUT = {
+_MAX_MESSAGE = 200  # characters of another library's message
+_MAX_NAMES = 4
+_REMEDIES = {
     "TracerBoolConversionError": "Replace `if` on an array by jnp.where.",
     "ConcretizationTypeError": "Replace `if` and float() on an array by jnp.where and jnp.",
-    "TracerArrayConversionError": "Use jax.numpy in place of numpy and math.",
+    "TracerArrayConversionError": "Use jax.numpy instead of numpy and math.",
 }
 
 
 def check_methods(twin: Twin) -> None:
     """
-    Check the declarations of a twin, and what each of its methods returns: type, shape, dtype.
+    Check the declarations of a twin, and type, shape and dtype of what each of its methods returns.
 
     Methods are evaluated abstractly (``jax.eval_shape``), in single and in double precision:
-    nothing is computed or compiled. Equal twins are checked once; those of the library are covered
+    nothing is computed or compiled. Equal twins are checked once. Twins of the library are covered
     by its tests and skipped.
 
     :raises TwinError: in one line, with the method, the expected and the actual return value
@@ -42,25 +42,25 @@ def check_methods(twin: Twin) -> None:
         hash(twin)
     except TypeError as error:
         raise TwinError(
-            f"The options of {type(twin).__name__} must be hashable, for equal twins share a "
-            f"compiled program: {error}. Use tuples in place of lists."
+            f"The options of {type(twin).__name__} must be hashable, because equal twins share a "
+            f"compiled program: {error}. Use tuples instead of lists."
         ) from None
     for layer in reversed(list(layers_of(twin))):
-        if not _is_tested_here(layer):
-            check_now(layer)
+        if not _is_from_library(layer):
+            check_layer(layer)
 
 
-def _is_tested_here(layer: Twin) -> bool:
-    """Whether nothing in it is of the user's own making."""
-    inside = (getattr(layer, name, None) for name in ("observation", "action", "stateful"))
-    parts = (layer, *getattr(layer, "effects", ()), *filter(None, inside))
+def _is_from_library(layer: Twin) -> bool:
+    """Whether the layer, its effects and its transforms are all classes of this package."""
+    transforms = (getattr(layer, name, None) for name in ("observation", "action", "stateful"))
+    parts = (layer, *getattr(layer, "effects", ()), *filter(None, transforms))
     return all(type(part).__module__.partition(".")[0] == "sb3_hds" for part in parts)
 
 
 @lru_cache(maxsize=256)
-def check_now(twin: Twin) -> None:
+def check_layer(twin: Twin) -> None:
     """
-    :func:`check_methods` for a single layer of a twin, tested here or not.
+    :func:`check_methods` for a single layer of a twin, from the library or not.
 
     :raises TwinError: as there
     """
@@ -82,9 +82,11 @@ def _check_declarations(twin: Twin) -> None:
                 f"{kind} must declare {name} as a tuple of {signal.__name__}, got {declared!r}. "
                 f"Write {form}, with a comma even after a single one."
             )
-        twice = [one for one, n in Counter(signal.name for signal in declared).items() if n > 1]
-        if twice:
-            raise TwinError(f"{kind} has {name} of the same name: {', '.join(twice)}. Rename one.")
+        counts = Counter(signal.name for signal in declared)
+        if repeated := [one for one, n in counts.items() if n > 1]:
+            raise TwinError(
+                f"{kind} has {name} of the same name: {', '.join(repeated)}. Rename one."
+            )
     for signal in (*twin.actuators, *twin.channels):
         if not signal.low < signal.high:
             raise TwinError(
@@ -101,7 +103,7 @@ def _check_declarations(twin: Twin) -> None:
 
 
 def _check_returns(twin: Twin, dtype: Any) -> None:
-    """:param dtype: of everything that goes in, and therefore of everything that comes out"""
+    """:param dtype: of all arguments, and therefore of all return values"""
 
     def array(*shape: int) -> Any:
         return jax.ShapeDtypeStruct(shape, dtype)
@@ -162,7 +164,10 @@ def _check_returns(twin: Twin, dtype: Any) -> None:
 
 
 def _n_positions(twin: Twin, state: Any, dof: int) -> int:
-    """Numbers of a position: one for each joint, or more where differences say so: quaternions."""
+    """
+    Length of a position: one number for each joint, or that of the state if ``difference`` accepts
+    it, as with quaternions.
+    """
     shape = getattr(getattr(state, "q", None), "shape", None)
     if not isinstance(state, State) or not shape or len(shape) != 1 or shape[0] <= dof:
         return dof
@@ -174,7 +179,7 @@ def _n_positions(twin: Twin, state: Any, dof: int) -> int:
 
 
 class _Caller:
-    """Evaluates methods of a twin abstractly, and says in one line what is wrong with them."""
+    """Evaluates methods of a twin abstractly; errors say in one line what is wrong."""
 
     def __init__(self, twin: Twin, dtype: Any) -> None:
         self.twin, self.dtype = twin, jnp.dtype(dtype)
@@ -189,7 +194,7 @@ class _Caller:
             raise TwinError(self._failure(method, function, error)) from error
 
     def expect(self, method: str, found: Any, like: Any, meaning: str) -> None:
-        """:param meaning: of the shape, in words"""
+        """:param meaning: what the shape means, in words"""
         if not isinstance(found, jax.ShapeDtypeStruct):
             self.refuse(method, _described(found), f"one array of shape {like.shape}: {meaning}")
         if found.shape != like.shape:
@@ -209,9 +214,9 @@ class _Caller:
         any_float: bool = False,
     ) -> None:
         """
-        :param n_q: numbers of a position
-        :param memory: what the state's has to be like; None: anything
-        :param any_float: whether another precision will do
+        :param n_q: length of a position
+        :param memory: whose shapes and dtypes the state's memory must have; None: any
+        :param any_float: whether another precision is accepted
         """
         if not isinstance(found, State):
             self.refuse(method, _described(found), "State(q, v, memory)")
@@ -238,14 +243,14 @@ class _Caller:
 
     def _failure(self, method: str, function: Callable[..., Any], error: Exception) -> str:
         message = " ".join(str(error).split())
-        message = message if len(message) <= _LONGEST else f"{message[:_LONGEST]}..."
+        message = message if len(message) <= _MAX_MESSAGE else f"{message[:_MAX_MESSAGE]}..."
         names = [base.__name__ for base in type(error).__mro__]
-        way_out = next((f" {_WAYS_OUT[name]}" for name in names if name in _WAYS_OUT), "")
+        remedy = next((f" {_REMEDIES[name]}" for name in names if name in _REMEDIES), "")
         if isinstance(error, KeyError):
-            way_out = f" Its parameters are: {', '.join(self.twin.params) or 'none'}."
+            remedy = f" Its parameters are: {', '.join(self.twin.params) or 'none'}."
         return (
             f"{type(self.twin).__name__}.{method} raises {type(error).__name__}"
-            f"{_line_of(function, error)}: {message}.{way_out}"
+            f"{_line_of(function, error)}: {message}.{remedy}"
         )
 
     def _cast(self, found: Any, like: Any) -> str:
@@ -259,15 +264,10 @@ class _Caller:
         )
 
 
-def missing_methods(kind: type[Twin]) -> list[str]:
-    """:return: the abstract methods that a class does not implement"""
-    return sorted(getattr(kind, "__abstractmethods__", ())) if inspect.isabstract(kind) else []
-
-
 def _listed(what: str, signals: Sequence[Any]) -> str:
-    """``"joint (hip, knee)"``, shortened where there are many."""
+    """``"joint (hip, knee)"``, with the first few names."""
     names = [signal.name for signal in signals]
-    shown = [*names[:_MOST_NAMED], *(["..."] if len(names) > _MOST_NAMED else [])]
+    shown = [*names[:_MAX_NAMES], *(["..."] if len(names) > _MAX_NAMES else [])]
     return f"{what} ({', '.join(shown) or 'none'})"
 
 
@@ -278,12 +278,12 @@ def _described(found: Any) -> str:
 
 
 def _summary(tree: Any) -> Any:
-    """Shapes and dtypes in the place of arrays."""
+    """The same tree with shapes and dtypes instead of arrays."""
     return jax.tree.map(lambda leaf: f"{leaf.dtype}{list(leaf.shape)}", tree)
 
 
 def _line_of(function: Callable[..., Any], error: Exception) -> str:
-    """Where in the file of the method it happened: `` (rigs.py, line 42)``."""
+    """The line of the method that raised: `` (rigs.py, line 42)``."""
     file = inspect.unwrap(function).__code__.co_filename if inspect.ismethod(function) else ""
     lines: Iterator[int | None] = (
         frame.lineno

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
+from sb3_hds.core.declarations import Parameter
 from sb3_hds.core.numerics.linear import solve_spd
-from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.types import (
     Action,
     Coordinates,
@@ -61,7 +61,7 @@ class Moment(NamedTuple):
 
 class JointMoment(NamedTuple):
     """
-    A :class:`Moment` as one joint sees it. All entries are scalars.
+    The entries of a :class:`Moment` for one joint. All are scalars.
 
     :param q: position [rad] or [m]
     :param v: velocity [rad/s] or [m/s]
@@ -82,15 +82,15 @@ class JointMoment(NamedTuple):
 
 class Ranges(NamedTuple):
     """
-    The range that the data of one joint or actuator cover, for grids of parameters.
+    The range that data of one joint or actuator cover, for grids of parameters.
 
-    :param excursion: how far the joint moves [rad] or [m]
-    :param speed: how fast it moves, root mean square [rad/s] or [m/s]
+    :param excursion: largest excursion of the joint [rad] or [m]
+    :param speed: root mean square of its velocity [rad/s] or [m/s]
     :param command: root mean square of the command, in its unit
     :param largest: largest command
     :param dt: sampling interval [s]
     :param period: of the motion [s]
-    :param turn: a whole turn of the joint, or infinity where it slides
+    :param turn: a full turn of a hinge [rad]; infinity for a slider
     """
 
     excursion: float
@@ -107,7 +107,7 @@ class Effect(abc.ABC):
     A physical effect of real hardware that the twin lacks. It vanishes at its null parameters.
 
     :param where: index or name of the joint, actuator or channel that it acts on
-    :param values: values of its parameters by name; default: null, where it changes nothing
+    :param values: values of its parameters by name; default: their nulls
     :raises EffectError: for an unknown parameter
     :raises ParameterError: for a value out of bounds
     """
@@ -115,10 +115,11 @@ class Effect(abc.ABC):
     name: ClassVar[str]
     #: ``"joint"``, ``"actuator"`` or ``"channel"``
     slot: ClassVar[str]
-    #: units are those of a rotary joint; ``"command unit"`` and ``"channel unit"`` become those of
-    #: the place, and a scale in command units is a share of the largest command
+    #: units are those of a rotary joint; ``"command unit"`` and ``"channel unit"`` stand for the
+    #: unit of the actuator or channel, and a scale in command units is a share of the largest
+    #: command
     parameters: ClassVar[Mapping[str, Parameter]]
-    #: one sentence for people
+    #: one sentence for reports
     explanation: ClassVar[str]
     #: where the equation comes from
     source: ClassVar[str]
@@ -127,18 +128,18 @@ class Effect(abc.ABC):
     equivalents: ClassVar[Mapping[str, str]] = {}
     #: parameters that must ascend in this order; otherwise a diagnosis does not report the effect
     ascending: ClassVar[tuple[str, ...]] = ()
-    #: its one parameter, where the effect is not linear in it: the equation error is interpolated
-    #: between the values of ``grid``
-    chained: ClassVar[str] = ""
-    #: a parameter that a combination of two slopes determines, taken at two values of it: the rest
-    #: position of a spring, the phase of a wave
+    #: the only parameter of an effect that is nonlinear in it: equation errors are interpolated
+    #: between its values in ``grid``
+    interpolated: ClassVar[str] = ""
+    #: a parameter that follows from the slopes at two of its values: the rest position of a spring,
+    #: the phase of a wave
     blended: ClassVar[str] = ""
-    #: time after which its memory has forgotten its initial value [periods of the motion]
+    #: time after which the initial value of its memory no longer matters [periods of the motion]
     forgets: ClassVar[float] = 0.4
-    #: arguments of the constructor besides ``where`` and the parameters: attributes that are saved
-    #: and that tell programs apart
+    #: arguments of the constructor besides ``where`` and the parameters: attributes that are saved,
+    #: and part of the key of a compiled program
     options: ClassVar[tuple[str, ...]] = ()
-    #: learned arrays by name, pytrees that travel with the parameters; most effects have none
+    #: learned arrays by name: pytrees that are passed along with the parameters
     tensors: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, where: int | str = 0, **values: float) -> None:
@@ -149,26 +150,26 @@ class Effect(abc.ABC):
         self._set(values)
 
     def with_values(self: _Effect, **values: float) -> _Effect:
-        """:return: the same effect with new values; equal to this one for the compiler"""
+        """:return: a copy with new values, which compares equal: it shares compiled programs"""
         changed = copy.copy(self)
         changed.values = dict(self.values)
         changed._set(values)
         return changed
 
     def with_tensors(self: _Effect, **tensors: Any) -> _Effect:
-        """:return: the same effect with new arrays of the same shapes; equal for the compiler"""
+        """:return: a copy with new arrays of the same shapes, which compares equal"""
         changed = copy.copy(self)
         changed.tensors = {**self.tensors, **tensors}
         return changed
 
     def fitted_to(self: _Effect, twin: "Twin") -> _Effect:
-        """:return: the same effect, with everything that depends on the twin it is attached to"""
+        """:return: the effect, set up for the twin that it is attached to"""
         return self
 
     def starts(self, excursion: float, speed: float) -> tuple[Mapping[str, float], ...]:
         """
-        :param excursion: how far the joint moves in the data [rad] or [m], a turn at most
-        :param speed: how fast it moves there [rad/s] or [m/s]
+        :param excursion: excursion of the joint in the data [rad] or [m], a turn at most
+        :param speed: its speed there [rad/s] or [m/s]
         :return: initial values of a search by name, for parameters with a zero gradient at the null
             and many local optima; empty where one start suffices
         """
@@ -176,10 +177,10 @@ class Effect(abc.ABC):
 
     def grid(self, ranges: Ranges) -> tuple[Mapping[str, float], ...]:
         """
-        :param ranges: what the data cover
-        :return: values by name between which the equation error is interpolated (``chained``), or
-            at which its slopes by the other parameters are taken; empty where the slopes at the
-            null suffice
+        :param ranges: the range of the data
+        :return: values by name between which equation errors are interpolated
+            (``interpolated``), or at which their slopes by the other parameters are taken; empty
+            where the slopes at the null suffice
         """
         return self.starts(ranges.excursion, 2.0 * ranges.speed)
 
@@ -193,13 +194,14 @@ class Effect(abc.ABC):
         """
         raise NotImplementedError(f"{self.name} is no combination of two settings.")
 
-    def doubt(self, twin: "Twin", state: Any, action: Action, base: Params, own: Params) -> Scalar:
+    def uncertainty_penalty(
+        self, twin: "Twin", state: Any, action: Action, base: Params, own: Params
+    ) -> Scalar:
         """
         :param twin: the twin that the effect is attached to
         :param base: parameters of that twin
         :param own: the effect's own parameters, without prefix
-        :return: penalty in planning for the uncertainty of the effect here, in the unit of the
-            reward
+        :return: what planning subtracts from the reward where the effect is uncertain
         """
         return jnp.zeros(())
 
@@ -219,14 +221,14 @@ class Effect(abc.ABC):
             self.values[name] = self.parameters[name].check(f"{self.name}.{name}", value)
 
     def to_spec(self) -> dict[str, Any]:
-        """:return: plain data from which the same effect can be made"""
+        """:return: plain data that describe the effect"""
         own = {name: getattr(self, name) for name in self.options}
         plain = {n: list(value) if isinstance(value, tuple) else value for n, value in own.items()}
         spec = {"effect": self.name, "where": self.where, "parameters": dict(self.values)}
         return spec | ({"options": plain} if plain else {})
 
     def structure(self) -> tuple[Any, ...]:
-        """What makes two effects different programs: everything but the values of parameters."""
+        """The key of the compiled program: everything but the values of parameters."""
         return (type(self), self.where, *(getattr(self, name) for name in self.options))
 
     def __eq__(self, other: object) -> bool:
@@ -244,12 +246,12 @@ class ForceEffect(Effect):
     """Adds a generalised force to the equation of motion."""
 
     slot: ClassVar[str] = "joint"
-    #: whether it is evaluated once, in the middle of each sub-step, and not at every stage of the
-    #: integrator; its memory then advances from the same moment, so that force and memory agree
+    #: whether it is evaluated once per sub-step, in the middle, instead of at every stage of the
+    #: integrator; its memory then advances from there, too, so that force and memory agree
     held: ClassVar[bool] = False
-    #: whether it depends on the load, or on how the mass matrix depends on the position. Where no
-    #: effect that is evaluated does, the load is zero and the mass matrix has no derivative: they
-    #: are most of what a step of a robot with many joints costs
+    #: whether it depends on the load, or on derivatives of the mass matrix. If no evaluated effect
+    #: does, the load is zero and the mass matrix has no derivative: both are expensive for robots
+    #: with many joints
     uses_load: ClassVar[bool] = True
 
     def memory(self, twin: "Twin") -> Memory:
@@ -268,7 +270,7 @@ class ForceEffect(Effect):
 
     def advance(self, moment: Moment, index: int, memory: Memory, params: Params) -> Memory:
         """
-        :param moment: the end of a sub-step; its middle if the effect is held
+        :param moment: the system at the end of a sub-step; in its middle if the effect is held
         :return: the memory after that sub-step
         """
         return memory
@@ -312,8 +314,8 @@ class SensorEffect(Effect):
     """
     Changes one measurement on its way out of the plant, once per control interval.
 
-    Of several sensors at one channel, each takes the output of the one before it. Reported values
-    may exceed the limits that the channel declares.
+    Several effects at one channel act in sequence. Reported values may exceed the limits that the
+    channel declares.
     """
 
     slot: ClassVar[str] = "channel"
@@ -326,17 +328,15 @@ class SensorEffect(Effect):
     def sense(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Scalar:
         """
         :param measured: the true value, in the unit of the channel
-        :param memory: as ``memory`` made it or ``advance`` left it, both having seen ``measured``
+        :param memory: from ``memory`` or ``advance``, which were called with ``measured``, too
         :param dt: length of the control interval [s]
         :param params: the effect's own parameters, without prefix
-        :return: what is reported
+        :return: the reported value
         """
 
     @abc.abstractmethod
     def invert(self, reported: Scalar, params: Params) -> Scalar:
-        """
-        :return: the best estimate of the true value from a single report at the start of an episode
-        """
+        """:return: the best estimate of the true value from the first report of an episode"""
 
     def advance(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Memory:
         """:return: the memory after a control interval that ends with the value ``measured``"""
@@ -344,7 +344,7 @@ class SensorEffect(Effect):
 
 
 def at_joint(moment: Moment, index: int) -> JointMoment:
-    """:return: the view of joint ``index``"""
+    """:return: the entries for the joint ``index``"""
     unit = jnp.zeros_like(moment.v).at[index].set(1.0)
     matrix = jax.lax.stop_gradient(moment.mass_matrix)
     inertia = 1.0 / solve_spd(matrix, unit)[index]

@@ -1,4 +1,4 @@
-"""The effects attached to a twin, as its ``step`` evaluates them."""
+"""The effects attached to a twin, in the form in which its ``step`` evaluates them."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
@@ -11,16 +11,7 @@ import numpy as np
 
 from sb3_hds.core.effect import ActionEffect, Effect, ForceEffect, Moment
 from sb3_hds.core.numerics.linear import solve_spd
-from sb3_hds.core.types import (
-    Action,
-    Force,
-    MassMatrix,
-    Memory,
-    Params,
-    Position,
-    Scalar,
-    Velocity,
-)
+from sb3_hds.core.types import Action, Force, MassMatrix, Memory, Params, Position, Scalar, Velocity
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,12 +36,12 @@ class Attached:
 
 class Chosen(NamedTuple):
     """
-    The subset of force effects that is evaluated; the others are taken to be null. It may change
-    between calls of one compiled program, whose run time is that of the subset. Forward-mode
-    derivatives only.
+    The force effects that are evaluated; the others count as null. The choice may change between
+    calls of one compiled program, and only chosen effects cost run time. Forward-mode derivatives
+    only.
 
-    :param free: indices of the effects evaluated at every stage, the chosen ones first, and how
-        many are chosen
+    :param free: indices of the effects evaluated at every stage, chosen ones first, and the number
+        of chosen ones
     :param held: the same for the held effects
     :param on: whether each effect is chosen, by key
     """
@@ -62,7 +53,7 @@ class Chosen(NamedTuple):
     @classmethod
     def of(cls, attached: tuple[Attached, ...], keys: Collection[str]) -> "Chosen":
         """
-        :param attached: all effects of the twin that are simulated
+        :param attached: all simulated effects of the twin
         :param keys: of the effects to evaluate
         """
         forces = {a.key: a.effect for a in attached if isinstance(a.effect, ForceEffect)}
@@ -79,9 +70,9 @@ class EffectChain:
     """
     The attached effects with their values, as ``Twin.step`` evaluates them at each sub-step.
 
-    :param attached: the effects, in the order of the signal path; sensors are left out
-    :param params: full parameters of the extended twin
-    :param chosen: the forces that are evaluated; None: all
+    :param attached: the effects, in the order of the signal path; sensor effects are ignored
+    :param params: all parameters of the extended twin
+    :param chosen: the force effects to evaluate; None: all
     """
 
     def __init__(
@@ -96,7 +87,7 @@ class EffectChain:
         self._chosen = chosen
 
     def __add__(self, other: "EffectChain") -> "EffectChain":
-        """:return: the effects of both; commands pass ``other`` last"""
+        """:return: the effects of both; commands pass those of ``other`` last"""
         both = EffectChain((), {}, self._chosen or other._chosen)
         both._actions = self._actions + other._actions
         both._forces = self._forces + other._forces
@@ -117,7 +108,7 @@ class EffectChain:
         return action, memory
 
     def force(self, moment: Moment, memory: dict[str, Memory], held: bool = False) -> Force:
-        """:return: the sum of all force effects that are held, or of all others, ``(dof,)``"""
+        """:return: the sum of the held force effects, or of the others, shape ``(dof,)``"""
         total = jnp.zeros_like(moment.v)
         forces = [
             partial(effect.force, moment, attached.index, memory[attached.key], params)
@@ -138,8 +129,8 @@ class EffectChain:
         mass_matrix: Callable[[], MassMatrix],
     ) -> tuple[Force, MassMatrix]:
         """
-        :return: both, or no load and a mass matrix without derivative where no effect that is
-            evaluated depends on them
+        :return: both; a zero load and a mass matrix without derivative if no evaluated effect
+            depends on them
         """
 
         def both() -> tuple[Force, MassMatrix]:
@@ -167,40 +158,39 @@ class EffectChain:
         displace: Callable[[Position, Velocity], Position],
     ) -> tuple[Force, Moment]:
         """
-        :param moment: the system at a position and a velocity; ``whole`` asks for its load even
-            where no effect uses it
+        :param moment: the system at a position and a velocity; ``with_load`` computes its load even
+            if no effect uses it
         :param q: at the start of the sub-step
         :param v: at the start of the sub-step
-        :param displace: moves a position along a velocity times a time
-        :return: the sum of all force effects that are held, ``(dof,)``, and the middle of the
-            sub-step, where they are evaluated: reached with what they are at its start
+        :param displace: moves a position by a velocity times a time
+        :return: the sum of the held force effects, ``(dof,)``, and the system in the middle of the
+            sub-step, where they are evaluated: it is reached with their values at the start
         """
+        zero = jnp.zeros_like(v)
         if not any(effect.held for _, effect, _ in self._forces):
-            return jnp.zeros_like(v), moment(q, v)
+            return zero, moment(q, v)
 
-        def towards(now: tuple[Force, Velocity], ahead: Scalar) -> tuple[Any, Any]:
-            place = displace(q, ahead * v), v + ahead * now[1]
-            there = moment(*place, whole=True)
+        def evaluate(now: tuple[Force, Velocity], ahead: Scalar) -> tuple[Any, Any]:
+            q_ahead, v_ahead = displace(q, ahead * v), v + ahead * now[1]
+            there = moment(q_ahead, v_ahead, with_load=True)
             force = self.force(there, memory, held=True)
             total = there.actuator + force - there.load
-            return (force, solve_spd(there.mass_matrix, total)), place
+            return (force, solve_spd(there.mass_matrix, total)), (q_ahead, v_ahead)
 
         def middle() -> tuple[Force, Position, Velocity]:
             ahead = jnp.array([0.0, 0.5], v.dtype) * h
-            # One loop: written out, it takes twice as long to compile.
-            still = jnp.zeros_like(v)
-            (force, _), (places, speeds) = jax.lax.scan(towards, (still, still), ahead)
-            return force, places[-1], speeds[-1]
+            # One loop: unrolled, it takes twice as long to compile.
+            (force, _), (qs, vs) = jax.lax.scan(evaluate, (zero, zero), ahead)
+            return force, qs[-1], vs[-1]
 
         if self._chosen is None:
-            force, *place = middle()
+            force, *at = middle()
         else:
-            nothing = lambda: (jnp.zeros_like(v), q, v)  # noqa: E731
-            force, *place = jax.lax.cond(self._chosen.held[1] > 0, middle, nothing)
-        return force, moment(*place)
+            force, *at = jax.lax.cond(self._chosen.held[1] > 0, middle, lambda: (zero, q, v))
+        return force, moment(*at)
 
     def advance(self, middle: Moment, end: Moment, memory: dict[str, Memory]) -> dict[str, Memory]:
-        """:return: the memory of the force effects after the sub-step with this middle and end"""
+        """:return: the memory of the force effects after a sub-step with this middle and end"""
         for attached, effect, params in self._forces:
             moment, before = middle if effect.held else end, memory[attached.key]
             advanced = partial(effect.advance, moment, attached.index, before, params)

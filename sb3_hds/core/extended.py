@@ -1,4 +1,4 @@
-"""A twin with effects attached is again a twin."""
+"""A twin with effects attached."""
 
 import dataclasses
 import inspect
@@ -9,14 +9,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
+from sb3_hds.core.declarations import Parameter
 from sb3_hds.core.effect import ActionEffect, Effect, ForceEffect, SensorEffect
 from sb3_hds.core.effect_chain import NO_EFFECTS, Attached, Chosen, EffectChain
-from sb3_hds.core.parameter import Parameter
 from sb3_hds.core.transformed import TransformedTwin
 from sb3_hds.core.twin import Layer, State, Twin
-from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar
+from sb3_hds.core.types import Action, Obs, Params, Scalar
 from sb3_hds.errors import EffectError
 
 
@@ -25,20 +25,20 @@ class ExtendedTwin(Layer):
     A twin plus effects. Parameters of an effect are named ``effect.place.parameter``, for example
     ``"viscous_friction.hinge.b"``.
 
-    Where the base twin has a parameter for the same thing (``native_effects``), the effect changes
-    that parameter instead of computing anything of its own: it adds to it, or multiplies it where
-    the effect is absent at one. Extending an extended twin flattens.
+    Where the base twin has a parameter for the same effect (``native_effects``), that parameter is
+    changed instead: the effect's value is added, or multiplied if the effect's null is one.
+    Extending an extended twin flattens.
 
     :param base: the twin to extend
-    :param effects: effects to attach, in the order in which a signal meets them
-    :raises EffectError: for an effect that comes twice at one place, or names a place that is none
+    :param effects: effects to attach, in the order of the signal path
+    :raises EffectError: for an effect that is attached twice at one place, or at an unknown place
     """
 
     def __init__(self, base: Twin, *effects: Effect) -> None:
         if isinstance(base, TransformedTwin):
             raise EffectError(
-                "Effects belong to the plant, below the wrapper that a TransformedTwin stands for. "
-                "Use twin.extend(*effects), which attaches them there."
+                "Effects must be attached to the plant, not to a TransformedTwin around it. Use "
+                "twin.extend(*effects), which does that."
             )
         if isinstance(base, ExtendedTwin):
             base, effects = base._base_with_values(), (*base.effects_with_values(), *effects)
@@ -50,11 +50,11 @@ class ExtendedTwin(Layer):
         self.base = base
         self.attached = tuple(_attach(effect, base) for effect in effects)
         self.effects = tuple(a.effect for a in self.attached)
-        twice = [key for key, count in Counter(a.key for a in self.attached).items() if count > 1]
-        if twice:
+        counts = Counter(a.key for a in self.attached)
+        if repeated := [key for key, count in counts.items() if count > 1]:
             raise EffectError(
-                f"An effect can be attached once at each place; {', '.join(twice)} "
-                "came more than once."
+                f"An effect can be attached once at each place; {', '.join(repeated)} was given "
+                "more than once."
             )
         self._mirror(base)
         for a in self.attached:
@@ -73,28 +73,27 @@ class ExtendedTwin(Layer):
         )
 
     def without(self, *keys: str) -> Twin:
-        mine = {a.key: effect for a, effect in zip(self.attached, self.effects_with_values())}  # noqa: B905
-        unknown = [key for key in keys if key not in mine]
-        if unknown:
+        own = {a.key: _with_values(a, self.params) for a in self.attached}
+        if unknown := [key for key in keys if key not in own]:
             raise EffectError(
-                f"{self.name} has no effect {', '.join(unknown)} attached. "
-                f"It has: {', '.join(mine)}."
+                f"{self.name} has no effect {', '.join(unknown)} attached. It has: "
+                f"{', '.join(own)}."
             )
-        left = [effect for key, effect in mine.items() if key not in keys]
+        kept = [effect for key, effect in own.items() if key not in keys]
         base = self._base_with_values()
-        return ExtendedTwin(base, *left) if left else base
+        return ExtendedTwin(base, *kept) if kept else base
 
     def at_interval(self, dt: float, substeps: int) -> "ExtendedTwin":
         base = self._base_with_values().at_interval(dt, substeps)
         return ExtendedTwin(base, *self.effects_with_values())
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
-        return self._remember(self.base.initial(key, self.base_params(params)), params)
+        return self._with_memory(self.base.initial(key, self.base_params(params)), params)
 
     def infer(self, obs: Obs, params: Params) -> State:
         for a, sensor in reversed(self._sensors):
             obs = obs.at[a.index].set(sensor.invert(obs[a.index], a.own(params)))
-        return self._remember(self.base.infer(obs, self.base_params(params)), params)
+        return self._with_memory(self.base.infer(obs, self.base_params(params)), params)
 
     def observe(self, state: State, params: Params) -> Obs:
         obs = self.base.observe(state, self.base_params(params))
@@ -118,35 +117,30 @@ class ExtendedTwin(Layer):
             obs = obs.at[a.index].set(reported)
         return state._replace(memory=memory)
 
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        return self.base.reward(state, action, next_state, self.base_params(params))
-
     def planning_reward(
         self, state: State, action: Action, next_state: State, params: Params
     ) -> Scalar:
         base = self.base_params(params)
         reward = self.base.planning_reward(state, action, next_state, base)
         for a in self._simulated:
-            reward = reward - a.effect.doubt(self.base, state, action, base, a.own(params))
+            own = a.own(params)
+            reward -= a.effect.uncertainty_penalty(self.base, state, action, base, own)
         return reward
 
-    def terminated(self, state: State, params: Params) -> Flag:
-        return self.base.terminated(state, self.base_params(params))
-
-    def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
-        return self.base.sketch(state, self.base_params(params))
+    def inner_params(self, state: State, params: Params) -> Params:
+        return self.base_params(params)
 
     def choose(self, keys: Collection[str]) -> Chosen:
         """
         :param keys: of effects, such as ``"viscous_friction.hinge"``
-        :return: what computes the forces of these alone, in ``EffectChain((), {}, chosen)`` as an
-            argument of ``step``
+        :return: a choice of these force effects, for ``EffectChain((), {}, chosen)`` as an argument
+            of ``step``
         """
         return Chosen.of(self._simulated, keys)
 
     def effects_with_values(self) -> tuple[Effect, ...]:
-        """:return: the effects, holding the values that the extended twin has for them now"""
-        return tuple(_holding(a, self.params) for a in self.attached)
+        """:return: the effects with the current values of the extended twin"""
+        return tuple(_with_values(a, self.params) for a in self.attached)
 
     def to_spec(self) -> dict[str, Any]:
         effects = [effect.to_spec() for effect in self.effects_with_values()]
@@ -159,13 +153,8 @@ class ExtendedTwin(Layer):
         parts = (self._base_with_values(), *self.effects_with_values())
         return f"{type(self).__name__}({', '.join(map(repr, parts))})"
 
-    def _base_with_values(self) -> Twin:
-        return self.base.with_parameters(
-            **{name: self.values[name] for name in self.base.parameters}
-        )
-
     def base_params(self, params: Params) -> Params:
-        """:return: parameters of the twin below, with what native effects change of them"""
+        """:return: parameters of the base twin, changed by the native effects"""
         own = {name: params[name] for name in self.base.parameters}
         for a in self._native:
             for name, target in self.base.native_effects[a.effect.name, a.index].items():
@@ -173,10 +162,8 @@ class ExtendedTwin(Layer):
                 own[target] = with_native(own[target], params[f"{a.key}.{name}"], added)
         return own
 
-    def _remember(self, state: State, params: Params) -> State:
-        """
-        Initialise the memory of every effect; ``scan`` needs one structure and dtype throughout.
-        """
+    def _with_memory(self, state: State, params: Params) -> State:
+        """Initialise the memory of every effect, in the dtype that ``scan`` needs throughout."""
         memory, dtype = {}, state.q.dtype
         for a in self._simulated:
             if isinstance(a.effect, ForceEffect | ActionEffect):
@@ -192,16 +179,16 @@ class ExtendedTwin(Layer):
 
 def with_native(own: Any, value: Any, parameter: Parameter) -> Any:
     """
-    :param own: the twin's parameter
+    :param own: value of the twin's parameter
     :param value: of the corresponding parameter of an effect
     :param parameter: that parameter
-    :return: their sum, or their product where the null of the effect is one
+    :return: the sum of both values; their product if the null of the effect is one
     """
     return own * value if parameter.null == 1.0 else own + value
 
 
-def _holding(attached: Attached, params: Params) -> Effect:
-    """The effect with its values from ``params``."""
+def _with_values(attached: Attached, params: Params) -> Effect:
+    """The effect with its values and tensors from ``params``."""
     own, effect = attached.own(params), attached.effect
     tensors = {name: own.pop(name) for name in effect.tensors}
     return effect.with_values(**own).with_tensors(**tensors)
@@ -225,8 +212,8 @@ def _attach(effect: Effect, twin: Twin) -> Attached:
 
 def _in_units_of(parameter: Parameter, twin: Twin, attached: Attached) -> Parameter:
     """
-    Convert units and scales, which effects declare for a rotary joint or by name: scales of forces
-    are relative to the typical force at the joint, scales of commands to the largest command.
+    Convert units and scales, which effects declare for a rotary joint or a generic channel: scales
+    of forces are relative to the typical force at the joint, those of commands to the largest one.
     """
     slot, index = attached.effect.slot, attached.index
     if slot == "joint":

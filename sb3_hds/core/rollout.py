@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from sb3_hds.core.twin import State, Twin
 from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar
 
-#: reward as a function of ``(state, action, next_state, params)``: ``Twin.reward``, or the like
+#: reward as a function of ``(state, action, next_state, params)``, such as ``Twin.reward``
 Reward = Callable[[State, Action, State, Params], Scalar]
 Policy = Callable[[Obs], Action]
 
@@ -22,7 +22,7 @@ class Rollout(NamedTuple):
     One simulated episode of ``steps`` steps.
 
     :param states: the initial state first; each leaf has ``steps + 1`` rows
-    :param obs: what the sensors report in these states, shape ``(steps + 1, n_obs)``
+    :param obs: observations of these states, shape ``(steps + 1, n_obs)``
     :param actions: action k acts from state k to state k + 1, shape ``(steps, n_act)``
     :param rewards: zero where not ``alive``, shape ``(steps,)``
     :param alive: whether step k starts before the episode has terminated, shape ``(steps,)``
@@ -46,7 +46,7 @@ def rollout(
     Apply a sequence of actions.
 
     The step that terminates the episode is still rewarded; afterwards the state is frozen and
-    rewards are zero, so that the motion of a fallen system does not enter a gradient. There is no
+    rewards are zero, so that gradients do not depend on the motion of a fallen system. There is no
     reset.
 
     :param actions: shape ``(steps, n_act)``
@@ -64,7 +64,7 @@ def rollout_policy(
     reward: Reward | None = None,
 ) -> Rollout:
     """
-    Let a policy act on what the twin's sensors report; otherwise as :func:`rollout`.
+    As :func:`rollout`, with the actions of a policy.
 
     :param policy: observation, shape ``(n_obs,)``, to action, shape ``(n_act,)``
     :param n_steps: length of the rollout
@@ -93,9 +93,9 @@ def _simulate(
         state, alive = carry
         action = choose(state, given)
         after = twin.step(state, action, params)
-        gained = jnp.where(alive, reward(state, action, after, params), 0.0)
+        earned = jnp.where(alive, reward(state, action, after, params), 0.0)
         after = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, state)
-        return (after, alive & ~twin.terminated(after, params)), (after, action, gained, alive)
+        return (after, alive & ~twin.terminated(after, params)), (after, action, earned, alive)
 
     start = (state, ~twin.terminated(state, params))
     _, (later, actions, rewards, alive) = jax.lax.scan(advance, start, inputs)

@@ -1,5 +1,6 @@
-"""A twin behind a wrapper, which is again a twin."""
+"""A twin whose observations or actions pass through a wrapper."""
 
+import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -8,28 +9,43 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core.effect import Effect
 from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
+from sb3_hds.core.transforms.barrier import Barrier
 from sb3_hds.core.transforms.base import (
     ActionTransform,
     ObservationTransform,
     Signals,
     StatefulTransform,
 )
-from sb3_hds.core.transforms.registry import (
-    TRANSFORMS,
-    Transform,
-    transform_from_spec,
-    transform_to_spec,
-)
+from sb3_hds.core.transforms.cpg import Rhythm
+from sb3_hds.core.transforms.filters import Continuity, Delay, LowPass, RateLimit, Scale
+from sb3_hds.core.transforms.history import History
+from sb3_hds.core.transforms.rescale import RescaleAction, RescaleObservation
 from sb3_hds.core.twin import Layer, State, Twin
-from sb3_hds.core.types import (
-    Action,
-    Flag,
-    Memory,
-    Obs,
-    Params,
-    Scalar,
-)
+from sb3_hds.core.types import Action, Memory, Obs, Params, Scalar
 from sb3_hds.errors import ParameterError
+
+Transform = ObservationTransform | ActionTransform | StatefulTransform
+
+# Arguments of ``TransformedTwin``, and the transforms that they take.
+_KINDS = {
+    "observation": ObservationTransform,
+    "action": ActionTransform,
+    "stateful": StatefulTransform,
+}
+
+#: the transforms that saved data can name
+TRANSFORMS: tuple[type[Transform], ...] = (
+    RescaleAction,
+    RescaleObservation,
+    RateLimit,
+    LowPass,
+    Delay,
+    Scale,
+    History,
+    Barrier,
+    Continuity,
+    Rhythm,
+)
 
 
 class TransformedTwin(Layer):
@@ -37,15 +53,15 @@ class TransformedTwin(Layer):
     A twin whose observations or actions pass through a wrapper. Parameters, states and rewards are
     those of the wrapped twin; a stateful wrapper adds its memory and its penalty.
 
-    Effects belong to the plant: :meth:`extend` attaches them to the twin below the wrapper, where
-    commands and measurements have their physical units.
+    Effects belong to the plant: :meth:`extend` attaches them to the wrapped twin, where commands
+    and measurements have their physical units.
 
-    :param base: the twin below
+    :param base: the wrapped twin
     :param observation: transform of observations; None: identity
     :param action: transform of actions; None: identity
     :param stateful: transform of both, with memory or access to the observation; excludes the
         other two
-    :raises ParameterError: if a transform does not fit the twin below, or comes with another
+    :raises ParameterError: if a transform does not fit the twin, or comes with another one
     """
 
     def __init__(
@@ -58,8 +74,8 @@ class TransformedTwin(Layer):
     ) -> None:
         if stateful is not None and (observation is not None or action is not None):
             raise ParameterError(
-                f"{type(stateful).__name__} is a wrapper of its own: put one TransformedTwin into "
-                "another instead of passing several transforms."
+                f"{type(stateful).__name__} cannot be combined with other transforms: put one "
+                "TransformedTwin into another."
             )
         self.base, self.observation, self.action = base, observation, action
         self.stateful = stateful
@@ -75,13 +91,13 @@ class TransformedTwin(Layer):
             self.actuators = action.actuators(base.actuators)
 
     def extend(self, *effects: Effect) -> "TransformedTwin":
-        return self._around(self._base_with_values().extend(*effects))
+        return self._with_base(self._base_with_values().extend(*effects))
 
     def without(self, *keys: str) -> "TransformedTwin":
-        return self._around(self._base_with_values().without(*keys))
+        return self._with_base(self._base_with_values().without(*keys))
 
     def at_interval(self, dt: float, substeps: int) -> "TransformedTwin":
-        return self._around(self._base_with_values().at_interval(dt, substeps))
+        return self._with_base(self._base_with_values().at_interval(dt, substeps))
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         state = self.base.initial(key, params)
@@ -89,12 +105,12 @@ class TransformedTwin(Layer):
             return state
         obs = self.base.observe(state, params)
         drawn = self.stateful.draw(jax.random.fold_in(key, 1), obs, self._below)
-        return self._remembering(state, drawn)
+        return self._with_memory(state, drawn)
 
     def infer(self, obs: Obs, params: Params) -> State:
         if self.stateful is not None:
             inside, memory = self.stateful.infer(obs, self._below)
-            return self._remembering(self.base.infer(inside, params), memory)
+            return self._with_memory(self.base.infer(inside, params), memory)
         if self.observation is not None:
             obs = self.observation.invert(obs, self.base.channels)
         return self.base.infer(obs, params)
@@ -115,7 +131,7 @@ class TransformedTwin(Layer):
             return self.base.step(state, command, params, effects)
         inside = {key: own for key, own in state.memory.items() if key != self._key}
         after = self.base.step(state._replace(memory=inside), command, params, effects)
-        return self._remembering(after, memory)
+        return self._with_memory(after, memory)
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
         command = self.command(state, action, params)
@@ -128,12 +144,6 @@ class TransformedTwin(Layer):
         command = self.command(state, action, params)
         reward = self.base.planning_reward(state, command, next_state, params)
         return reward - self._cost(state, action, params)
-
-    def terminated(self, state: State, params: Params) -> Flag:
-        return self.base.terminated(state, params)
-
-    def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
-        return self.base.sketch(state, params)
 
     def to_spec(self) -> dict[str, Any]:
         spec = self._base_with_values().to_spec()
@@ -167,20 +177,41 @@ class TransformedTwin(Layer):
         obs = self.base.observe(state, params)
         return self.stateful.cost(action, obs, state.memory[self._key], self._below)
 
-    def _remembering(self, state: State, memory: Memory) -> State:
+    def _with_memory(self, state: State, memory: Memory) -> State:
         return state._replace(memory=state.memory | {self._key: memory})
 
     def _parts(self) -> list[Transform]:
         parts = (self.observation, self.action, self.stateful)
         return [part for part in parts if part is not None]
 
-    def _around(self, base: Twin) -> "TransformedTwin":
+    def _with_base(self, base: Twin) -> "TransformedTwin":
         return TransformedTwin(
             base, observation=self.observation, action=self.action, stateful=self.stateful
         )
 
-    def _base_with_values(self) -> Twin:
-        return self.base.with_parameters(**self.values).with_tensors(self.tensors)
+
+def transform_to_spec(transform: Transform) -> dict[str, Any]:
+    """:return: plain data from which :func:`transform_from_spec` makes an equal transform"""
+    fields = {f.name: getattr(transform, f.name) for f in dataclasses.fields(transform)}
+    return {"transform": transform.name} | fields
+
+
+def transform_from_spec(
+    spec: Mapping[str, Any], known: Iterable[type[Transform]] = TRANSFORMS
+) -> Transform:
+    """
+    :param spec: what :func:`transform_to_spec` returned
+    :param known: the classes that the names of transforms stand for
+    :raises ParameterError: for the name of another transform
+    """
+    by_name = {transform.name: transform for transform in known}
+    if spec["transform"] not in by_name:
+        raise ParameterError(
+            f"A twin was saved with the unknown transform '{spec['transform']}'. Known transforms: "
+            f"{', '.join(by_name)}."
+        )
+    fields = {name: value for name, value in spec.items() if name != "transform"}
+    return by_name[spec["transform"]](**fields)
 
 
 def seen_through(
@@ -191,25 +222,20 @@ def seen_through(
     """
     Rebuild the saved wrappers around a twin.
 
-    :param base: the twin below all of them
-    :param layers: ``to_spec()["transforms"]``, the wrapper next to ``base`` first
-    :param known: the classes among which transforms are found by name
-    :raises ParameterError: if a transform is not among them, or does not fit the twin below
+    :param base: the innermost twin
+    :param layers: ``to_spec()["transforms"]``, the innermost wrapper first
+    :param known: the classes that the names of transforms stand for
+    :raises ParameterError: for another transform, or one that does not fit the twin
     """
     for layer in layers:
-        parts = (transform_from_spec(part, known) for part in layer)
-        placed: dict[str, Any] = {_place_of(part): part for part in parts}
+        parts = [transform_from_spec(part, known) for part in layer]
+        placed: Any = {
+            name: p for p in parts for name, kind in _KINDS.items() if isinstance(p, kind)
+        }
         base = TransformedTwin(base, **placed)
     return base
 
 
-def _place_of(transform: Transform) -> str:
-    """The argument of ``TransformedTwin`` for a transform."""
-    if isinstance(transform, StatefulTransform):
-        return "stateful"
-    return "observation" if isinstance(transform, ObservationTransform) else "action"
-
-
 def _depth(base: Twin) -> int:
-    """Number of wrappers around the plant; it makes the keys of memories unique."""
+    """Number of wrappers around the plant, which makes the keys of memories unique."""
     return 1 + _depth(base.base) if isinstance(base, TransformedTwin) else 0

@@ -1,9 +1,9 @@
-"""The interface of every differentiable simulator."""
+"""The interface of all differentiable simulators."""
 
 import abc
 import copy
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -12,10 +12,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sb3_hds.core.declarations import Actuator, Channel, Joint, Parameter
 from sb3_hds.core.effect import Effect
 from sb3_hds.core.effect_chain import NO_EFFECTS, EffectChain
-from sb3_hds.core.parameter import Parameter
-from sb3_hds.core.signals import Actuator, Channel, Joint
 from sb3_hds.core.types import (
     Action,
     Coordinates,
@@ -36,7 +35,7 @@ _Twin = TypeVar("_Twin", bound="Twin")
 
 class State(NamedTuple):
     """
-    The state of a simulation: all that the next step depends on besides action and parameters.
+    The state of a simulation: with action and parameters, it determines the next step.
 
     :param q: generalised position [rad] or [m], shape ``(dof,)``; longer where quaternions are
         among its numbers
@@ -53,19 +52,19 @@ class Twin(abc.ABC):
     """
     A differentiable simulator of one system.
 
-    Its methods are pure and unbatched, and safe under ``jit``, ``vmap``, ``scan`` and forward-mode
-    differentiation; callers do the batching. Values of parameters are always passed in ``params``;
-    a method never reads them from ``self``. Twins that differ in nothing else are therefore equal
-    and share one compiled program.
+    Its methods are pure and unbatched (callers ``vmap``), and safe under ``jit``, ``vmap``,
+    ``scan`` and forward-mode differentiation. Values of parameters are always passed in ``params``;
+    a method never reads them from ``self``. Twins that differ only in them are therefore equal and
+    share one compiled program.
 
     A subclass declares its signals and parameters as class attributes and implements the abstract
     methods. Mechanical systems with a mass matrix are shorter as an ``AnalyticTwin``.
 
     :param dt: control interval [s]; default: the class attribute
     :param substeps: internal steps per control interval; default: the class attribute
-    :param settings: values of parameters by name, and of the options that the class declares
-    :raises ParameterError: for a name that is neither, a value out of bounds, or an impossible step
-    :raises TwinError: for a class without name, or whose parameters are no ``Parameter``
+    :param settings: values of parameters and of the class's options, by name
+    :raises ParameterError: for an unknown name, a value out of bounds, or an impossible step
+    :raises TwinError: for a class without a name, or whose parameters are no ``Parameter``
     """
 
     name: str
@@ -77,19 +76,21 @@ class Twin(abc.ABC):
     channels: tuple[Channel, ...]
     parameters: Mapping[str, Parameter]
     max_episode_steps: int | None = None
-    #: ``"reverse"`` where reverse mode works too, ``"forward"`` where only forward mode does.
+    #: ``"reverse"`` if reverse mode works, too; ``"forward"`` if only forward mode does
     differentiability: str = "reverse"
-    #: False where the reward is flat almost everywhere: then override ``planning_reward``.
+    #: False if the reward is flat almost everywhere: then override ``planning_reward``
     reward_has_gradient: bool = True
     #: (effect name, index of its place) -> {its parameter: the twin's parameter that it adds to, or
-    #: multiplies where the effect is absent at one}
+    #: multiplies if the effect's null is one}
     native_effects: Mapping[tuple[str, int], Mapping[str, str]] = {}
-    #: Parameters that are known exactly: a diagnosis takes them as given, and a calibration keeps
-    #: them unless it is asked to estimate them.
+    #: parameters that are known exactly: a diagnosis does not suspect them, and a calibration
+    #: estimates them only on request
     known_parameters: frozenset[str] = frozenset()
-    #: Structural choices with their defaults, set by keyword: ``{"goal": "stop"}``.
+    #: structural choices with their defaults, set by keyword: ``{"goal": "stop"}``
     options: ClassVar[Mapping[str, Any]] = {}
-    #: Learned arrays of attached effects, by full name: pytrees that travel with the parameters.
+    #: admissible values of options that take only a few: ``{"goal": ("stop", "hold")}``
+    choices: ClassVar[Mapping[str, Collection[Any]]] = {}
+    #: learned arrays of attached effects, by full name: pytrees that are passed in ``params``
     tensors: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(
@@ -107,6 +108,12 @@ class Twin(abc.ABC):
         self.dt, self.substeps = float(dt), int(substeps)
         for option, default in self.options.items():
             setattr(self, option, settings.pop(option, default))
+        for option, allowed in self.choices.items():
+            if (value := getattr(self, option)) not in tuple(allowed):
+                raise ParameterError(
+                    f"{option} of {self.name} must be one of {', '.join(map(repr, allowed))}, got "
+                    f"{value!r}."
+                )
         self.values: dict[str, float] = {
             name: parameter.null for name, parameter in self.parameters.items()
         }
@@ -114,13 +121,13 @@ class Twin(abc.ABC):
 
     @property
     def params(self) -> Params:
-        """The current values of all parameters: what every method takes as ``params``."""
+        """The current values of all parameters, as every method takes them in ``params``."""
         return {**self.values, **self.tensors}
 
     def with_parameters(self: _Twin, **values: float) -> _Twin:
         """
         :param values: new values by full name, in the units of ``parameters``
-        :return: the same twin with these values; equal to this one for the compiler
+        :return: a copy with these values, which compares equal: it shares compiled programs
         :raises ParameterError: for an unknown name or a value out of bounds
         """
         changed = copy.copy(self)
@@ -131,7 +138,7 @@ class Twin(abc.ABC):
     def with_tensors(self: _Twin, tensors: Mapping[str, Any]) -> _Twin:
         """
         :param tensors: new arrays by full name, of the same shapes
-        :return: the same twin with these arrays; equal to this one for the compiler
+        :return: a copy with these arrays, which compares equal
         :raises ParameterError: for an unknown name
         """
         unknown = set(tensors) - set(self.tensors)
@@ -155,7 +162,7 @@ class Twin(abc.ABC):
         return changed
 
     def extend(self, *effects: Effect) -> "Twin":
-        """:return: this twin plus ``effects``, in the order in which a signal meets them"""
+        """:return: this twin with ``effects`` attached, in the order of the signal path"""
         from sb3_hds.core.extended import ExtendedTwin
 
         return ExtendedTwin(self, *effects)
@@ -182,8 +189,8 @@ class Twin(abc.ABC):
 
     def typical_forces(self) -> tuple[float, ...]:
         """
-        :return: the largest force of actuators and gravity on each joint at rest [N m] or [N], a
-            scale for friction and the like; 0 where it is unknown
+        :return: the largest force of actuators and gravity on each joint at rest [N m] or [N], as a
+            scale for effects; 0 if unknown
         """
         return (0.0,) * len(self.joints)
 
@@ -196,7 +203,7 @@ class Twin(abc.ABC):
         """
         The state that corresponds to an observation: the inverse of :meth:`observe`.
 
-        Unobserved parts are set to zero, and the subclass documents which they are.
+        Unobserved parts are set to zero; the subclass documents which ones.
         """
 
     @abc.abstractmethod
@@ -211,39 +218,36 @@ class Twin(abc.ABC):
         Advance by one control interval ``dt``.
 
         :param action: in the units of the action space; clipped to it as the environment does
-        :param effects: attached effects, to be evaluated at every internal sub-step
+        :param effects: attached effects, evaluated at every sub-step
         """
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        """The reward of the environment for this step; zero where there is no task."""
+        """The reward of the environment for this step; zero without a task."""
         return jnp.zeros(())
 
     def planning_reward(
         self, state: State, action: Action, next_state: State, params: Params
     ) -> Scalar:
         """
-        The objective of planning: the reward, or a smooth surrogate where that has no gradient.
+        The objective of planning: the reward, or a smooth surrogate if that has no gradient.
 
-        It counts up to and including the terminating step and is zero afterwards. Where survival is
-        the goal it must therefore be positive; otherwise planning learns to terminate early.
+        It counts up to and including the terminating step. If survival is the goal, it must be
+        positive: otherwise planning learns to terminate early.
         """
         return self.reward(state, action, next_state, params)
 
     def terminated(self, state: State, params: Params) -> Flag:
-        """Whether the task ends in this state; time limits do not count."""
+        """Whether the state terminates the task; time limits do not count."""
         return jnp.zeros((), bool)
 
     def coordinates(self, q: Position) -> Coordinates:
-        """
-        :return: the position of each joint, as effects and reports use it; override it for
-            quaternions
-        """
+        """:return: the position of each joint, for effects and reports; override for quaternions"""
         return q
 
     def difference(self, state: State, reference: State) -> Tangent:
         """
-        :return: tangent vector from ``reference`` to ``state``: of positions and of velocities one
-            number for each joint, then the memory; override it for quaternions
+        :return: tangent vector from ``reference`` to ``state``: one number per joint for positions,
+            likewise for velocities, then the memory; override for quaternions
         """
         return ravel_pytree(state)[0] - ravel_pytree(reference)[0]
 
@@ -253,7 +257,7 @@ class Twin(abc.ABC):
         return unravel(flat + tangent)
 
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
-        """A line drawing for rendering [m]: by default a bar as high as each joint's position."""
+        """A line drawing for rendering [m]; by default a bar per joint, as high as its position."""
         base = jnp.arange(state.q.shape[0], dtype=state.q.dtype)
         zero = jnp.zeros_like(base)
         return jnp.stack(
@@ -284,7 +288,7 @@ class Twin(abc.ABC):
         return f"{type(self).__name__}({values})"
 
     def _check_declared(self) -> None:
-        """Check the declarations that values depend on."""
+        """Check the declarations that parameter values depend on."""
         kind = type(self).__name__
         if not isinstance(getattr(self, "name", None), str):
             raise TwinError(f"{kind} has no name. Write it into the class: name = 'MyTwin'.")
@@ -322,9 +326,20 @@ class Twin(abc.ABC):
 
 
 class Layer(Twin):
-    """A twin around another one, whose positions and tangents are those of the inner one."""
+    """
+    Abstract: a twin around another one. By default it forwards to the inner twin, with the state
+    and the parameters that :meth:`inner_state` and :meth:`inner_params` return.
+    """
 
     base: Twin
+
+    def inner_state(self, state: State) -> State:
+        """:return: the state as the inner twin has it"""
+        return state
+
+    def inner_params(self, state: State, params: Params) -> Params:
+        """:return: the parameters of the inner twin"""
+        return params
 
     def coordinates(self, q: Position) -> Coordinates:
         return self.base.coordinates(q)
@@ -334,6 +349,30 @@ class Layer(Twin):
 
     def retract(self, state: State, tangent: Tangent) -> State:
         return self.base.retract(state, tangent)
+
+    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        own = self.inner_params(state, params)
+        return self.base.reward(self.inner_state(state), action, self.inner_state(next_state), own)
+
+    def planning_reward(
+        self, state: State, action: Action, next_state: State, params: Params
+    ) -> Scalar:
+        own = self.inner_params(state, params)
+        return self.base.planning_reward(
+            self.inner_state(state), action, self.inner_state(next_state), own
+        )
+
+    def terminated(self, state: State, params: Params) -> Flag:
+        return self.base.terminated(self.inner_state(state), self.inner_params(state, params))
+
+    def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
+        return self.base.sketch(self.inner_state(state), self.inner_params(state, params))
+
+    def _base_with_values(self) -> Twin:
+        """The inner twin with the values and tensors that this layer has for it now."""
+        values = {name: self.values[name] for name in self.base.parameters}
+        tensors = {name: self.tensors[name] for name in self.base.tensors}
+        return self.base.with_parameters(**values).with_tensors(tensors)
 
 
 def layers_of(twin: Twin) -> Iterator[Twin]:

@@ -14,7 +14,5 @@ Obs: TypeAlias = Float[Array, " obs"]
 Tangent: TypeAlias = Float[Array, " tangent"]  # a small change of a state
 Scalar: TypeAlias = Float[Array, ""]
 Flag: TypeAlias = Bool[Array, ""]
-Memory: TypeAlias = (
-    Any  # what an effect carries from sub-step to sub-step: a pytree of float arrays
-)
+Memory: TypeAlias = Any  # of an effect, from one sub-step to the next: a pytree of float arrays
 Params: TypeAlias = dict[str, Any]  # by full parameter name: a float or a scalar array

@@ -6,12 +6,12 @@ Importing it registers the log readers with ``Trajectories.load``.
 Names are imported on first use, so that a control loop on a robot loads neither JAX nor PyTorch.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from sb3_hds.core.trajectories.log_reader import read_logs_by
-from sb3_hds.lazy import lazily
+from sb3_hds.core.trajectories.storage import register_log_reader
+from sb3_hds.lazy import lazy_imports
 
-if TYPE_CHECKING:
+with lazy_imports(__name__):
     from sb3_hds.core.trajectories import Trajectories
     from sb3_hds.data.audit import Audit, audit
     from sb3_hds.data.audit.finding import Finding
@@ -43,16 +43,4 @@ def _load(files: Any, columns: Any) -> "Trajectories":
     return load(files, columns)
 
 
-read_logs_by(_load)
-lazily(
-    __name__,
-    {
-        "audit": ("Audit", "audit"),
-        "audit.finding": ("Finding",),
-        "columns": ("Columns", "Entry", "Label", "columns_from"),
-        "load": ("SamplingWarning", "load"),
-        "recording": ("Recorder",),
-        "resampling.report": ("Reading", "Sampling"),
-        "sb3_hds.core.trajectories": ("Trajectories",),
-    },
-)
+register_log_reader(_load)

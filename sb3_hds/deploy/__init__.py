@@ -4,11 +4,9 @@ Policies on a robot: an ONNX file that needs no learning library, and a header o
 Names are imported on first use: running a file imports neither jax nor torch.
 """
 
-from typing import TYPE_CHECKING
+from sb3_hds.lazy import lazy_imports
 
-from sb3_hds.lazy import lazily
-
-if TYPE_CHECKING:
+with lazy_imports(__name__):
     from sb3_hds.deploy.c_header import Header, export_c
     from sb3_hds.deploy.export import Exported, export_onnx
     from sb3_hds.deploy.onnx_policy import OnnxPolicy
@@ -26,14 +24,3 @@ __all__ = [
     "export_onnx",
     "run_policy",
 ]
-
-lazily(
-    __name__,
-    {
-        "c_header": ("Header", "export_c"),
-        "export": ("Exported", "export_onnx"),
-        "onnx_policy": ("OnnxPolicy",),
-        "policy_function": ("Memory", "PolicyFunction"),
-        "run": ("Latencies", "run_policy"),
-    },
-)

@@ -1,5 +1,7 @@
 """The catalogue of effects: a class listed in ``ALL`` is tested, offered and documented."""
 
+from collections.abc import Iterable
+
 from sb3_hds.core import Effect
 from sb3_hds.effects.actuator import (
     ActionDelay,
@@ -9,6 +11,7 @@ from sb3_hds.effects.actuator import (
     Saturation,
     TorqueGain,
 )
+from sb3_hds.effects.flexible import ClearanceSpring, Hysteresis
 from sb3_hds.effects.joint import (
     ConcaveFriction,
     CoulombFriction,
@@ -20,15 +23,13 @@ from sb3_hds.effects.joint import (
     StribeckFriction,
     ViscousFriction,
 )
-from sb3_hds.effects.nameless import ClearanceSpring, Hysteresis
-from sb3_hds.effects.names import effect_named
 from sb3_hds.effects.neural import NeuralForce, force_of
 from sb3_hds.effects.position import Cogging, ConstantForce, CubicStiffness, Stiffness
 from sb3_hds.effects.sensor import SensorBias, SensorDelay, SensorScale, SignFlip, reversed_joint
 from sb3_hds.effects.transmission import Backlash, JointElasticity
+from sb3_hds.errors import EffectError, did_you_mean
 
-# In the order in which a signal meets them: a bus, then the drive, then its motor; a sensor, then
-# its bus.
+# In the order of the signal path: a bus, the drive, its motor; a sensor, its bus.
 ALL: tuple[type[Effect], ...] = (
     ViscousFriction,
     DirectionalViscousFriction,
@@ -56,12 +57,11 @@ ALL: tuple[type[Effect], ...] = (
     SensorDelay,
 )
 
-#: What exists and no catalogue of names can be complete of: never the name of a cause, but what
-#: causes at joints are measured against.
+#: flexible forces, which stand for effects outside the catalogue: a diagnosis never names them as a
+#: cause, but a cause at a joint must predict better than they do
 NAMELESS: tuple[type[Effect], ...] = (ClearanceSpring, Hysteresis)
 
-#: Everything that a saved twin may have attached: the catalogue, and what is never the name of a
-#: cause, a learned residual among it.
+#: everything that a saved twin may have attached: also flexible forces and learned residuals
 KNOWN: tuple[type[Effect], ...] = (*ALL, *NAMELESS, NeuralForce)
 
 __all__ = [
@@ -100,3 +100,21 @@ __all__ = [
     "force_of",
     "reversed_joint",
 ]
+
+
+def effect_named(name: str, kinds: Iterable[type[Effect]]) -> type[Effect]:
+    """
+    :param name: ``"coulomb_friction"``, ``"CoulombFriction"`` or ``"coulomb friction"``
+    :param kinds: the classes to search
+    :raises EffectError: for an unknown name; the message suggests the nearest one
+    """
+    by_name = {kind.name: kind for kind in kinds}
+    by_letters = {_letters(known): kind for known, kind in by_name.items()}
+    if _letters(name) in by_letters:
+        return by_letters[_letters(name)]
+    meant = did_you_mean(name.lower(), by_name)
+    raise EffectError(f"There is no effect '{name}'.{meant} There are: {', '.join(by_name)}.")
+
+
+def _letters(name: str) -> str:
+    return "".join(letter for letter in name.rpartition(".")[2].lower() if letter.isalnum())

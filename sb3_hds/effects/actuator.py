@@ -1,4 +1,4 @@
-"""What happens to a command on its way to the plant."""
+"""Effects between the command and the plant."""
 
 from typing import TYPE_CHECKING
 
@@ -10,12 +10,12 @@ from sb3_hds.effects.shapes import Delayed, beyond
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
 
-# A command that no drive has yet received.
+# The command before an episode.
 _AT_REST = 0.0
-# Time constants below this share of a sub-step leave nothing of the past: exp(-1000) is zero.
+# Smaller time constants [sub-steps] count as zero: exp(-1000) is zero.
 _INSTANT = 1e-3
-# Between which equation errors interpolate: lags and delays in intervals and as shares of a period
-# of the motion, widths in root mean square commands, limits in the largest one.
+# Values between which equation errors are interpolated: lags [sampling intervals], up to a share of
+# the period of the motion; widths [root mean square commands]; limits [largest commands].
 _LAGS = (0.0, 0.5, 1.0, 1.6, 2.5, 4.0, 6.0, 9.0, 13.0, 18.0)
 _LONGEST_SHARE = 0.3
 _WIDTHS = (0.0, 0.1, 0.2, 0.36, 0.56, 0.84, 1.2, 1.7, 2.4)
@@ -24,7 +24,7 @@ _LIMITS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)
 
 class TorqueGain(ActionEffect):
     r"""
-    Scales the command: the drive is stronger or weaker than the model says.
+    Scales the command: the drive is stronger or weaker than in the model.
 
     .. math:: u' = k\,u
 
@@ -49,12 +49,12 @@ class TorqueGain(ActionEffect):
 
 class MotorLag(ActionEffect):
     r"""
-    The drive follows its command with a delay of first order, exactly integrated.
+    The drive follows its command with a first-order lag, integrated exactly.
 
     .. math:: T\,\dot u' = u - u'
 
-    What reaches the plant during a sub-step is the mean of :math:`u'` over it. At the start of an
-    episode the drive is at rest. At :math:`T = 0` the derivative is that of a growing :math:`T`.
+    The plant receives the mean of :math:`u'` over each sub-step. An episode starts with the drive
+    at rest. At :math:`T = 0` the derivative is the one-sided derivative towards larger :math:`T`.
 
     Source: Åström and Murray, *Feedback Systems*, Princeton University Press 2021, section 3.
     """
@@ -63,7 +63,7 @@ class MotorLag(ActionEffect):
     parameters = {"time_constant": Parameter(null=0.0, scale=0.02, unit="s", lower=0.0, upper=2.0)}
     explanation = "The drive takes time to follow its command, as a motor with inductance does."
     source = "Åström and Murray 2021, section 3"
-    chained = "time_constant"
+    interpolated = "time_constant"
     equivalents = {"action_delay": "where commands change slowly compared with either"}
 
     def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
@@ -78,9 +78,9 @@ class MotorLag(ActionEffect):
         self, command: Scalar, memory: Memory, h: float, params: Params
     ) -> tuple[Scalar, Memory]:
         time_constant = params["time_constant"]
-        kept = jnp.exp(-h / jnp.maximum(time_constant, _INSTANT * h))
-        after = command + (memory - command) * kept
-        mean = command + (memory - command) * (1.0 - kept) * time_constant / h
+        decay = jnp.exp(-h / jnp.maximum(time_constant, _INSTANT * h))
+        after = command + (memory - command) * decay
+        mean = command + (memory - command) * (1.0 - decay) * time_constant / h
         return mean, after
 
 
@@ -90,11 +90,10 @@ class ActionDelay(Delayed, ActionEffect):
 
     .. math:: u'(t) = u(t - d)
 
-    Commands are held over a control interval, and what reaches the plant during a sub-step is their
-    mean over it, so the delay need not be a multiple of either. Attach it before effects that
-    change a command within the interval. Before the first command of an episode, zero arrives.
-    Where the delay is a multiple of the sub-step, zero included, the derivative is that of a
-    growing delay.
+    Commands are held over a control interval, and the plant receives their mean over each sub-step,
+    so the delay need not be a multiple of either. Attach it before effects that change a command
+    within the interval. Before the first command of an episode, zero arrives. If the delay is a
+    multiple of the sub-step, or zero, the derivative is the one-sided one towards larger delays.
 
     Source: Åström and Murray, *Feedback Systems*, Princeton University Press 2021, section 10.
 
@@ -105,14 +104,14 @@ class ActionDelay(Delayed, ActionEffect):
     name = "action_delay"
     explanation = "Commands reach the drive late, as over a bus or a radio link."
     source = "Åström and Murray 2021, section 10"
-    chained = "delay"
+    interpolated = "delay"
     equivalents = {
         "motor_lag": "where commands change slowly compared with either",
         "sensor_delay": "where every channel is as late and nothing is fed back",
     }
 
     def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
-        """Exact for what lies between: a held command that comes a part of an interval later."""
+        """Interpolation is exact: held commands that arrive within an interval mix linearly."""
         longest = min(_LONGEST_SHARE * ranges.period, self.longest)
         n = max(1, min(int(longest / ranges.dt + 1e-9), 24))
         return tuple({"delay": k * ranges.dt} for k in range(n + 1))
@@ -129,7 +128,7 @@ class ActionDelay(Delayed, ActionEffect):
     def act(
         self, command: Scalar, memory: Memory, h: float, params: Params
     ) -> tuple[Scalar, Memory]:
-        """``elapsed`` is the time since the control interval began, up to this sub-step."""
+        """``elapsed`` is the time from the start of the control interval to this sub-step."""
         interval = memory["interval"]
         begins = memory["elapsed"] > interval - 0.5 * h
         elapsed = jnp.where(begins, 0.0, memory["elapsed"])
@@ -139,7 +138,7 @@ class ActionDelay(Delayed, ActionEffect):
         begin = elapsed - params["delay"]
         held_from = -interval * jnp.arange(commands.shape[0])
         held_to = jnp.where(jnp.arange(commands.shape[0]) == 0, jnp.inf, held_from + interval)
-        # Not minimum and maximum: where both are equal, those take half of the derivative.
+        # Not minimum and maximum, which halve the derivative where their arguments are equal.
         until = jnp.where(begin + h <= held_to, begin + h, held_to)
         since = jnp.where(begin > held_from, begin, held_from)
         arrives = (begin + h > held_from) & (begin <= held_to)
@@ -150,12 +149,12 @@ class ActionDelay(Delayed, ActionEffect):
 
 class DirectionalGain(ActionEffect):
     r"""
-    Scales the command, by another factor for each sign.
+    Scales the command, by a different factor for each sign.
 
     .. math:: u' = \begin{cases} k_+ u & u > 0 \\ k_- u & u \le 0 \end{cases}
 
-    A command of one sign says nothing about the other: there the derivative is zero. At
-    :math:`u = 0`, the derivative with respect to the command is :math:`k_-`.
+    The derivative by the factor of the other sign is zero. At :math:`u = 0`, the derivative by the
+    command is :math:`k_-`.
 
     Source: Armstrong-Hélouvry, Dupont and Canudas de Wit, *A survey of models, analysis tools and
     compensation methods for the control of machines with friction*, Automatica 30(7), 1994.
@@ -179,12 +178,12 @@ class DirectionalGain(ActionEffect):
 
 class DeadZone(ActionEffect):
     r"""
-    Small commands do nothing, and larger ones lose as much.
+    Small commands have no effect, and larger ones are reduced by the same amount.
 
     .. math:: u' = \max(u - w / 2, 0) + \min(u + w / 2, 0)
 
-    The width :math:`w` is that of the whole zone, from :math:`-w / 2` to :math:`w / 2`. Inside, the
-    derivative is zero, so planning cannot feel its way out.
+    The zone extends from :math:`-w / 2` to :math:`w / 2`. Inside, the derivative is zero, so
+    planning gets no gradient there.
 
     Source: Slotine and Li, *Applied Nonlinear Control*, Prentice Hall 1991, section 5.2.
     """
@@ -193,11 +192,11 @@ class DeadZone(ActionEffect):
     parameters = {"width": Parameter(null=0.0, scale=0.1, unit="command unit", lower=0.0)}
     explanation = "Small commands do not move the drive, and larger ones lose as much."
     source = "Slotine and Li 1991, section 5.2"
-    chained = "width"
+    interpolated = "width"
     equivalents = {"coulomb_friction": "while the joint moves the way it is driven"}
 
     def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
-        """None is wider than the largest command: that would be a gain of zero."""
+        """Widths below the largest command: a wider zone would be a gain of zero."""
         widths = [share * ranges.command for share in _WIDTHS]
         return tuple({"width": w} for w in widths if w < ranges.largest)
 
@@ -209,15 +208,14 @@ class DeadZone(ActionEffect):
 
 class Saturation(ActionEffect):
     r"""
-    The drive does no more than it can.
+    The drive limits its command.
 
     .. math:: u' = \min(\max(u, -l), l)
 
-    :math:`l = 0` stands for no limit: as with every effect, zero is absence. True absence is
-    :math:`l \to \infty`, where no command reaches the limit and nothing has a derivative; so the
-    effect jumps at zero, where there is no derivative either, and a search has to begin at a limit
-    that commands reach. By :math:`l`, the derivative is the sign of a command beyond it, and zero
-    for one within.
+    :math:`l = 0` stands for no limit, because every effect is absent at its null. The effect
+    therefore jumps at zero, where it has no derivative, and a search must start at a limit that
+    commands reach. The derivative by :math:`l` is the sign of a command beyond the limit, and zero
+    for a command within it.
 
     Source: Slotine and Li, *Applied Nonlinear Control*, Prentice Hall 1991, section 5.2.
     """
@@ -228,7 +226,7 @@ class Saturation(ActionEffect):
         "The drive does not reach the largest commands, because of its current or voltage."
     )
     source = "Slotine and Li 1991, section 5.2"
-    chained = "limit"
+    interpolated = "limit"
 
     def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
         return tuple({"limit": share * ranges.largest} for share in _LIMITS if ranges.largest)

@@ -1,8 +1,6 @@
 """Friction and drag at a joint."""
 
-import dataclasses
 import math
-from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,19 +9,19 @@ from sb3_hds.core import JointEffect, JointMoment, Memory, Parameter, Params, Ra
 from sb3_hds.effects.shapes import STANDSTILL, dry_friction
 from sb3_hds.errors import EffectError
 
-# Speed at which friction falls before data say, in units of that below which it is smoothed.
-_FALLS = 10.0
-# Of the speed of a motion: up to where its friction may fall.
+# Null of the speed at which a friction curve bends, in units of the smoothed speed.
+_BEND = 10.0
+# Initial values of a search for the Stribeck speed, as shares of the speed of the motion.
 _SHARES = (0.03, 0.1, 0.3, 1.0)
-# Likewise, where the slope of concave friction falls, and in how many steps equation errors try it.
+# Range of the speed at which concave friction bends, as shares of the speed of the motion, and the
+# number of values at which equation errors are evaluated.
 _BENDS, _STEPS = (0.2, 1.0), 8
 
 
-def _bends_beyond(parameters: Mapping[str, Parameter], standstill: float) -> dict[str, Parameter]:
-    """No curve of friction can be seen to bend at a speed at which it is smoothed."""
-    speed = _FALLS * standstill
-    bend = dataclasses.replace(parameters["v_s"], null=speed, scale=speed, lower=standstill)
-    return {**parameters, "v_s": bend}
+def _bend(standstill: float = STANDSTILL) -> Parameter:
+    """The speed at which a friction curve bends; it is visible only above the smoothed range."""
+    speed = _BEND * standstill
+    return Parameter(null=speed, scale=speed, unit="rad/s", lower=standstill)
 
 
 class ViscousFriction(JointEffect):
@@ -33,8 +31,8 @@ class ViscousFriction(JointEffect):
     .. math:: \tau = -\min(b,\; I / h)\,v
 
     The bound is the coefficient that stops the joint within one sub-step :math:`h` (:math:`I` is
-    its effective inertia); beyond it an explicit integrator would turn friction into a drive. There
-    the derivative with respect to :math:`b` is zero.
+    its effective inertia); with larger ones an explicit integrator is unstable. Beyond the bound
+    the derivative by :math:`b` is zero.
 
     Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control
     4(3), 1998, section 2.
@@ -58,14 +56,14 @@ class ViscousFriction(JointEffect):
 
 class DirectionalViscousFriction(JointEffect):
     r"""
-    Friction that grows with speed, in one direction more than in the other.
+    Friction that grows with speed, with a different coefficient for each direction.
 
     .. math::
         \tau = -\min(b,\; I / h)\,v, \qquad
         b = \begin{cases} b_+ & v > 0 \\ b_- & v \le 0 \end{cases}
 
-    The bound is the same as that of :class:`ViscousFriction`. A motion in one direction says
-    nothing about the other: there the derivative is zero.
+    The bound is that of :class:`ViscousFriction`. The derivative by the coefficient of the other
+    direction is zero.
 
     Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control
     4(3), 1998, section 2 (curves of friction over speed need not be symmetrical).
@@ -90,7 +88,7 @@ class DirectionalViscousFriction(JointEffect):
 
 class DryFriction(JointEffect):
     """
-    A force against the motion that jumps at standstill, smoothed so that it can be simulated.
+    Abstract: a force against the motion that jumps at standstill, smoothed for simulation.
 
     :param standstill: option; speed below which it is smoothed [rad/s] or [m/s]
     :raises EffectError: unless that is positive
@@ -105,6 +103,8 @@ class DryFriction(JointEffect):
         if not (isinstance(standstill, int | float) and 0.0 < standstill < math.inf):
             raise EffectError(f"standstill is a positive speed, got {standstill!r}.")
         self.standstill = float(standstill)
+        if "v_s" in self.parameters:
+            self.parameters = {**self.parameters, "v_s": _bend(standstill)}  # type: ignore[misc]
         super().__init__(where, **values)
 
     def against(self, joint: JointMoment, level: Scalar | float) -> Scalar:
@@ -119,11 +119,11 @@ class CoulombFriction(DryFriction):
     .. math:: \tau = -\tau_c \tanh(v / w), \qquad w = \max(w_0,\; \tau_c h / I)
 
     The sign function is smoothed over :math:`w`: at least :math:`w_0`, the option ``standstill``,
-    and never less than what a sub-step :math:`h` can stop (:math:`I` is the joint's effective
-    inertia): so friction at one joint does not overshoot standstill at any step length. What this
-    costs: a joint never sticks; under a load :math:`f < \tau_c` it creeps at
-    :math:`w\,\mathrm{artanh}(f / \tau_c)` instead. Dry friction at several strongly coupled
-    joints at once may chatter around standstill if :math:`h` is long.
+    and at least the speed that a sub-step :math:`h` can stop (:math:`I` is the joint's effective
+    inertia), so that friction at one joint never overshoots standstill. The cost: a joint never
+    sticks; under a load :math:`f < \tau_c` it creeps at :math:`w\,\mathrm{artanh}(f / \tau_c)`.
+    Dry friction at several strongly coupled joints may chatter around standstill if :math:`h` is
+    long.
 
     Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control
     4(3), 1998, section 2.
@@ -156,10 +156,9 @@ class DirectionalCoulombFriction(DryFriction):
         \tau = -\tau \tanh(v / w), \qquad
         \tau = \begin{cases} \tau_+ & v > 0 \\ \tau_- & v \le 0 \end{cases}
 
-    It is smoothed over :math:`w` as :class:`CoulombFriction` is, at the same cost. While the joint
-    moves, it is Coulomb friction of :math:`(\tau_+ + \tau_-) / 2` and a constant force of
-    :math:`(\tau_- - \tau_+) / 2`; at standstill the constant force would go on pushing, and this
-    does not.
+    Smoothed over :math:`w` as :class:`CoulombFriction` is. While the joint moves, it equals Coulomb
+    friction of :math:`(\tau_+ + \tau_-) / 2` and a constant force of :math:`(\tau_- - \tau_+) / 2`;
+    unlike a constant force, it vanishes at standstill.
 
     Source: Janot, Gautier and Brunot, *Data set and reference models of EMPS*, Workshop on
     Nonlinear System Identification Benchmarks, 2019 (there as Coulomb friction and an offset).
@@ -183,16 +182,15 @@ class DirectionalCoulombFriction(DryFriction):
 
 class StribeckFriction(DryFriction):
     r"""
-    Dry friction that falls as the joint begins to move.
+    Dry friction that decreases as the joint begins to move.
 
     .. math::
         \tau = -\Big(\tau_c + (\tau_s - \tau_c)\,e^{-(v / v_s)^2}\Big) \tanh(v / w)
 
-    It is smoothed over :math:`w` as :class:`CoulombFriction` is, at the same cost, so what is left
-    of breaking away is a hump of friction at speeds between :math:`w` and :math:`v_s`; a
-    :math:`v_s` below :math:`w` does not show. Without friction, :math:`v_s` has no derivative.
-    :math:`\tau_s < \tau_c` can be simulated, friction that rises as the joint begins to move, but a
-    diagnosis never calls that by this name.
+    Smoothed over :math:`w` as :class:`CoulombFriction` is, so breakaway becomes a peak of friction
+    at speeds between :math:`w` and :math:`v_s`; a :math:`v_s` below :math:`w` has no effect.
+    Without friction, :math:`v_s` has no derivative. :math:`\tau_s < \tau_c` can be simulated, but a
+    diagnosis does not report it.
 
     Source: Olsson et al., *Friction models and friction compensation*, European Journal of Control
     4(3), 1998, section 2 (exponent 2).
@@ -202,23 +200,15 @@ class StribeckFriction(DryFriction):
     parameters = {
         "tau_c": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
         "tau_s": Parameter(null=0.0, scale=0.15, unit="N m", lower=0.0),
-        "v_s": Parameter(
-            null=_FALLS * STANDSTILL, scale=_FALLS * STANDSTILL, unit="rad/s", lower=STANDSTILL
-        ),
+        "v_s": _bend(),
     }
     explanation = "The joint resists most just as it begins to move, and less once it slides."
     source = "Olsson et al. 1998, section 2"
     equivalents = {"coulomb_friction": "while the joint moves several times faster than v_s"}
     ascending = ("tau_c", "tau_s")
 
-    def __init__(
-        self, where: int | str = 0, *, standstill: float = STANDSTILL, **values: float
-    ) -> None:
-        self.parameters = _bends_beyond(type(self).parameters, standstill)  # type: ignore[misc]
-        super().__init__(where, standstill=standstill, **values)
-
     def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
-        """From a hump that is narrower than any motion, nothing leads to a wider one."""
+        """Several widths of the peak: a narrow one has no gradient towards wider ones."""
         return tuple({"v_s": max(share * speed, self.standstill)} for share in _SHARES)
 
     def torque(self, joint: JointMoment, memory: Memory, params: Params) -> Scalar:
@@ -229,13 +219,13 @@ class StribeckFriction(DryFriction):
 
 class ConcaveFriction(DryFriction):
     r"""
-    Viscous friction whose slope falls with speed, as of greased gears.
+    Viscous friction whose slope decreases with speed, as in greased gears.
 
     .. math:: \tau = -\frac{b\,|v|}{1 + |v| / v_s} \tanh(v / w)
 
-    At speeds far below :math:`v_s` it is viscous friction of coefficient :math:`b`, far above it is
-    dry friction of :math:`b\,v_s`. It is bounded around standstill as :class:`CoulombFriction` is.
-    Without friction, :math:`v_s` has no derivative.
+    Far below :math:`v_s` it is viscous friction of coefficient :math:`b`, far above it dry friction
+    of :math:`b\,v_s`. It is smoothed around standstill as :class:`CoulombFriction` is. Without
+    friction, :math:`v_s` has no derivative.
 
     Source: Waiboer, Aarts and Jonker, *Velocity dependence of joint friction in robotic
     manipulators with gear transmissions*, ECCOMAS Multibody Dynamics 2005 (friction of lubricated
@@ -246,9 +236,7 @@ class ConcaveFriction(DryFriction):
     name = "concave_friction"
     parameters = {
         "b": Parameter(null=0.0, scale=0.05, unit="N m s/rad", lower=0.0),
-        "v_s": Parameter(
-            null=_FALLS * STANDSTILL, scale=_FALLS * STANDSTILL, unit="rad/s", lower=STANDSTILL
-        ),
+        "v_s": _bend(),
     }
     explanation = "The joint resists motion the more the faster it is, but less than in proportion."
     source = "Waiboer et al. 2005"
@@ -257,14 +245,8 @@ class ConcaveFriction(DryFriction):
         "coulomb_friction": "while the joint moves several times faster than v_s",
     }
 
-    def __init__(
-        self, where: int | str = 0, *, standstill: float = STANDSTILL, **values: float
-    ) -> None:
-        self.parameters = _bends_beyond(type(self).parameters, standstill)  # type: ignore[misc]
-        super().__init__(where, standstill=standstill, **values)
-
     def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
-        """A curve that bends below all speeds of the motion, or above them, is another one's."""
+        """Bends within the speeds of the motion: otherwise the friction is dry or viscous."""
         return tuple({"v_s": max(share * speed, self.standstill)} for share in _BENDS)
 
     def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
@@ -278,16 +260,16 @@ class ConcaveFriction(DryFriction):
 
 class LoadDependentFriction(DryFriction):
     r"""
-    Dry friction that grows with what the joint transmits, as between the teeth of a gear.
+    Dry friction that grows with the transmitted torque, as between the teeth of a gear.
 
     .. math::
         \tau = -(\tau_c + \mu\,|\tau_g|) \tanh(v / w), \qquad \tau_g = \tau_\text{act} + c(q, v)
 
-    Here :math:`\tau_g` is the torque that presses the teeth together: that of the motor from one
-    side, and from the other what gravity, Coriolis forces and the twin's own damping put on the
-    joint. As :math:`M \dot v = \tau_\text{act} - c`, both add up where the motor holds its load:
+    Here :math:`\tau_g` is the torque that presses the teeth together: that of the motor on one
+    side, and that of gravity, Coriolis forces and the twin's own damping on the other. As
+    :math:`M \dot v = \tau_\text{act} - c`, both add up when the motor holds its load:
     :math:`\tau_g` is then twice the motor's torque, as in the source. Torques of other effects are
-    left out. It is smoothed over :math:`w` as :class:`CoulombFriction` is, at the same cost.
+    not included. Smoothed over :math:`w` as :class:`CoulombFriction` is.
 
     Source: Duclusaud et al., *Extended friction models for the physics simulation of servo
     actuators*, arXiv 2410.08650, 2024, model M3 (without its viscous friction).
@@ -310,11 +292,11 @@ class LoadDependentFriction(DryFriction):
 
 class QuadraticDrag(JointEffect):
     r"""
-    Resistance of a medium: grows with the square of the speed.
+    Resistance of a medium, which grows with the square of the speed.
 
     .. math:: \tau = -\min(c\,|v|,\; I / h)\,v
 
-    The bound is the same as that of :class:`ViscousFriction`.
+    The bound is that of :class:`ViscousFriction`.
 
     Source: Fossen, *Handbook of Marine Craft Hydrodynamics and Motion Control*, Wiley 2011,
     section 6.4.

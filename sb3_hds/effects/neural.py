@@ -1,4 +1,4 @@
-"""A learned residual: the force that no named effect accounts for."""
+"""A learned residual force."""
 
 import os
 from collections.abc import Sequence
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from sb3_hds.core import Twin
 
 _FORMAT = "sb3_hds.NeuralForce"
-# Largest force that a member can give, in units of the normalised output.
-_LARGEST = 3.0
+# Largest force of a member, in units of the normalised output.
+_MAX_OUTPUT = 3.0
 
 
 class NeuralForce(ForceEffect):
@@ -35,21 +35,21 @@ class NeuralForce(ForceEffect):
         \qquad z = (q, \cos q, \sin q, v, \tau_\text{act})
 
     Angles enter by cosine and sine, sliders as they are. Inputs and output are normalised by
-    :math:`\mu, \sigma, \sigma_\tau`, which belong to the weights. It is bounded, so it cannot run
-    away where there were no data. It is evaluated once at the start of each sub-step and held: at
-    every stage of the integrator, networks would be most of the cost of planning.
+    :math:`\mu, \sigma, \sigma_\tau`, which belong to the weights. The output is bounded, so it
+    cannot diverge outside the data. It is evaluated once per sub-step and held: at every stage of
+    the integrator, networks would dominate the cost of planning.
 
-    It is never the name of a cause: it measures what is left when the named causes are accounted
-    for, and it lets a policy be learned all the same.
+    A diagnosis never names it as a cause. It measures the residual of the named causes, and lets a
+    policy be learned in spite of it.
 
     Source: Chua et al., *Deep reinforcement learning in a handful of trials*, NeurIPS 2018
     (ensembles); Heiden et al., *NeuralSim*, ICRA 2021 (residual forces inside a simulation).
 
-    :param where: the joint by which it is named; it acts on all of them
+    :param where: the joint that it is named after; it acts on all joints
     :param n_members: networks in the ensemble
     :param net_arch: units of the hidden layers
-    :param caution: what planning pays for each unit of disagreement, in the reward's unit
-    :param values: ``share``, how much of it acts: 0 nothing, 1 all
+    :param caution: penalty in planning per unit of disagreement
+    :param values: ``share``, the factor :math:`s`: 0 for no force, 1 for the learned one
     :raises EffectError: for an unknown parameter, or sizes that are not positive
     """
 
@@ -73,19 +73,20 @@ class NeuralForce(ForceEffect):
         super().__init__(where, **values)
         if n_members < 1 or not all(width >= 1 for width in net_arch):
             raise EffectError(
-                f"An ensemble needs members and units, got {n_members} of {tuple(net_arch)}."
+                f"An ensemble needs at least one member, and layers at least one unit, got "
+                f"{n_members} of {tuple(net_arch)}."
             )
         self.n_members, self.net_arch = int(n_members), tuple(int(width) for width in net_arch)
         self.caution = float(caution)
         self.hinges: tuple[bool, ...] = ()
 
     def fitted_to(self, twin: "Twin") -> "NeuralForce":
-        """:return: with random weights, for the joints of ``twin``, unless it has its own"""
+        """:return: the effect for the joints of ``twin``; with random weights if it has none"""
         hinges = tuple(joint.unit == "rad" for joint in twin.joints)
         if self.tensors and hinges != self.hinges:
             raise EffectError(
-                f"This NeuralForce was learned on {len(self.hinges)} joint(s) of other kinds than "
-                f"those of {twin.name}. Learn it again: sysid.fit_residual."
+                f"This NeuralForce was learned for {len(self.hinges)} joint(s), other than those "
+                f"of {twin.name}. Learn it again: sysid.fit_residual."
             )
         if self.tensors:
             return self
@@ -94,8 +95,10 @@ class NeuralForce(ForceEffect):
         return fitted.with_tensors(**fitted.fresh(jax.random.key(0)))
 
     def fresh(self, key: Array) -> dict[str, Any]:
-        """:return: random weights, normalised as if every input and output were of size one"""
-        n_in, n_out = self._n_inputs, len(self.hinges)
+        """:return: random weights, with means of zero and scales of one"""
+        # Positions (two numbers for an angle), velocities and actuator forces.
+        n_out = len(self.hinges)
+        n_in = 3 * n_out + sum(self.hinges)
         draw = lambda k: self._network.init(k, jnp.zeros(n_in))["params"]  # noqa: E731
         return {
             "weights": jax.vmap(draw)(jax.random.split(key, self.n_members)),
@@ -105,23 +108,22 @@ class NeuralForce(ForceEffect):
         }
 
     def inputs(self, q: Coordinates, v: Velocity, actuator: Force) -> Float[Array, " inputs"]:
-        """:return: what the networks see, before it is normalised"""
-        sliders = [i for i, hinge in enumerate(self.hinges) if not hinge]
-        hinges = [i for i, hinge in enumerate(self.hinges) if hinge]
-        turned, slid = q[jnp.array(hinges, int)], q[jnp.array(sliders, int)]
-        return jnp.concatenate([slid, jnp.cos(turned), jnp.sin(turned), v, actuator])
+        """:return: the inputs of the networks before normalisation"""
+        hinges = np.array(self.hinges, bool)
+        angles = q[hinges]
+        return jnp.concatenate([q[~hinges], jnp.cos(angles), jnp.sin(angles), v, actuator])
 
     def forces(
         self, q: Coordinates, v: Velocity, actuator: Force, own: Params
     ) -> Float[Array, "members dof"]:
-        """:return: what each member says [N m] or [N], whole, whatever the share"""
-        seen = (self.inputs(q, v, actuator) - own["input_mean"]) / own["input_scale"]
-        say = lambda weights: jnp.asarray(self._network.apply({"params": weights}, seen))  # noqa: E731
-        said = jax.vmap(say)(own["weights"])
-        return own["output_scale"] * _LARGEST * jnp.tanh(said / _LARGEST)
+        """:return: the force of each member for a share of one [N m] or [N]"""
+        x = (self.inputs(q, v, actuator) - own["input_mean"]) / own["input_scale"]
+        apply = lambda weights: jnp.asarray(self._network.apply({"params": weights}, x))  # noqa: E731
+        outputs = jax.vmap(apply)(own["weights"])
+        return own["output_scale"] * _MAX_OUTPUT * jnp.tanh(outputs / _MAX_OUTPUT)
 
     def force_at(self, q: Coordinates, v: Velocity, actuator: Force, own: Params) -> Force:
-        """:return: the ensemble's mean, as much of it as acts [N m] or [N]"""
+        """:return: the mean of the ensemble times the share [N m] or [N]"""
         return own["share"] * jnp.mean(self.forces(q, v, actuator, own), 0)
 
     def force(self, moment: Moment, index: int, memory: Memory, params: Params) -> Force:
@@ -129,13 +131,15 @@ class NeuralForce(ForceEffect):
 
     def disagreement(self, q: Coordinates, v: Velocity, actuator: Force, own: Params) -> Scalar:
         """
-        :return: standard deviation of the members, in units of the normalised output; the largest
+        :return: standard deviation of the members in units of the normalised output, the largest
             over the joints
         """
         std = jnp.std(self.forces(q, v, actuator, own), 0)
         return jnp.max(std / own["output_scale"])
 
-    def doubt(self, twin: "Twin", state: Any, action: Action, base: Params, own: Params) -> Scalar:
+    def uncertainty_penalty(
+        self, twin: "Twin", state: Any, action: Action, base: Params, own: Params
+    ) -> Scalar:
         if not self.caution:
             return jnp.zeros(())
         actuator = twin.actuate(state, action, base)  # type: ignore[attr-defined]
@@ -147,7 +151,7 @@ class NeuralForce(ForceEffect):
 
     def save(self, path: str | os.PathLike[str]) -> Any:
         """
-        Write one ``.npz`` file, without pickle; a file of that name is replaced as a whole.
+        Write one ``.npz`` file, without pickle; a file of that name is replaced.
 
         :return: the path of the file
         :raises EffectError: before it was attached to a twin
@@ -195,10 +199,6 @@ class NeuralForce(ForceEffect):
             raise EffectError(f"'{path}' was not written by NeuralForce.save ({error}).") from error
 
     @property
-    def _n_inputs(self) -> int:
-        return len(self.hinges) + sum(self.hinges) + 2 * len(self.hinges)
-
-    @property
     def _network(self) -> "_Member":
         return _Member(self.net_arch, len(self.hinges))
 
@@ -210,14 +210,14 @@ class _Member(nn.Module):
     n_out: int
 
     @nn.compact
-    def __call__(self, seen: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
+    def __call__(self, x: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
         for width in self.net_arch:
-            seen = jnp.tanh(nn.Dense(width)(seen))
-        return nn.Dense(self.n_out)(seen)
+            x = jnp.tanh(nn.Dense(width)(x))
+        return nn.Dense(self.n_out)(x)
 
 
 def force_of(twin: "Twin") -> tuple[str, NeuralForce] | None:
-    """:return: full name and effect of the learned force that a twin has; None without one"""
+    """:return: full name and effect of a twin's learned force; None without one"""
     for layer in layers_of(twin):
         for a in getattr(layer, "attached", ()):
             if isinstance(a.effect, NeuralForce):

@@ -1,4 +1,4 @@
-"""Forces that depend on where a joint is, or on nothing."""
+"""Forces that depend on the position of a joint, and constant ones."""
 
 import math
 from collections.abc import Mapping
@@ -7,26 +7,26 @@ import jax.numpy as jnp
 
 from sb3_hds.core import JointEffect, JointMoment, Memory, Parameter, Params, Ranges, Scalar
 
-# Periods that the range of motion may hold, close enough that a fit finds those in between; and
-# parts of a period by which the force may be shifted.
+# Initial values of a search: numbers of periods in the range of motion, dense enough for a fit to
+# find those in between, and phases as shares of a period.
 _CYCLES = (0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0)
-_TURNS = (0.0, 0.25, 0.5, 0.75)
-# The same where nothing is fitted in between, in shares of the longest: that fits twice into the
-# range of motion, since slower waves are springs, and four times into a turn, since gravity's wave
-# is a whole one.
-_WAVES = (*(1.0 + 0.125 * k for k in range(17)), *(3.25 + 0.25 * k for k in range(20)))
-_COARSEST = 0.25
+_PHASES = (0.0, 0.25, 0.5, 0.75)
+# Values of the grid: the longest period divided by these. It fits twice into the range of motion,
+# since longer waves look like springs, and four times into a turn, since gravity has one period per
+# turn.
+_DIVISORS = (*(1.0 + 0.125 * k for k in range(17)), *(3.25 + 0.25 * k for k in range(20)))
+_LONGEST = 0.25  # [turns]
 
 
 class Stiffness(JointEffect):
     r"""
-    A spring pulls the joint to where it rests.
+    A spring pulls the joint to its rest position.
 
     .. math:: \tau = -\min(k,\; I / h^2)\,(q - q_0)
 
-    The bound is the stiffness whose oscillation a sub-step :math:`h` can just follow (:math:`I` is
-    the joint's effective inertia); beyond it the derivative with respect to :math:`k` is zero. The
-    position counts whole turns. Without a spring, :math:`q_0` has no derivative.
+    The bound is the stiffness whose oscillation a sub-step :math:`h` can just resolve (:math:`I` is
+    the joint's effective inertia); beyond it the derivative by :math:`k` is zero. Full turns count:
+    the position is not wrapped. Without a spring, :math:`q_0` has no derivative.
 
     Source: Rao, *Mechanical Vibrations*, Prentice Hall 2011, section 1.7 (spring elements).
     """
@@ -62,12 +62,12 @@ class Stiffness(JointEffect):
 
 class CubicStiffness(JointEffect):
     r"""
-    A spring at zero that hardens: it hardly acts near zero, and pulls back strongly far from it.
+    A hardening spring at zero: weak near zero, and strong far from it.
 
     .. math:: \tau = -\min(k_3\,q^2,\; I / h^2)\,q
 
-    The bound is the same as that of :class:`Stiffness`. Springs that soften are not meant: alone,
-    they would pull the joint away.
+    The bound is that of :class:`Stiffness`. Softening springs are excluded: alone, they are
+    unstable.
 
     Source: Kovacic and Brennan, *The Duffing Equation*, Wiley 2011, chapter 2.
     """
@@ -89,10 +89,10 @@ class Cogging(JointEffect):
     .. math:: \tau = -\min\!\Big(A,\; \frac{\lambda I}{2 \pi h^2}\Big)
               \sin\frac{2 \pi\,(q - \varphi)}{\lambda}
 
-    It rests at :math:`q = \varphi`, and at every period :math:`\lambda` from there: both are
-    positions of the joint. The bound is the same as that of :class:`Stiffness`, for the steepest
-    place. At zero amplitude, period and phase have no derivative, and a local search for the period
-    ends at the nearest one that fits at all.
+    It rests at :math:`q = \varphi`, and at every period :math:`\lambda` from there, both in the
+    unit of the joint. The bound is that of :class:`Stiffness` at the largest slope. At zero
+    amplitude, period and phase have no derivative, and a local search for the period ends in the
+    nearest local optimum.
 
     Source: *MuJoCo DC motor model*, Google DeepMind 2026, section 1.2 (its phase is
     :math:`\pi - 2 \pi \varphi / \lambda`).
@@ -102,7 +102,7 @@ class Cogging(JointEffect):
     name = "cogging"
     parameters = {
         "amplitude": Parameter(null=0.0, scale=0.1, unit="N m", lower=0.0),
-        # One sixth of a turn: the coarsest that motors are built with.
+        # One sixth of a turn: the longest period of common motors.
         "period": Parameter(null=math.pi / 3.0, scale=0.2, unit="rad", lower=1e-9),
         "phase": Parameter(null=0.0, scale=0.2, unit="rad"),
     }
@@ -112,16 +112,12 @@ class Cogging(JointEffect):
 
     def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
         periods = [excursion / n for n in _CYCLES]
-        return tuple(
-            {"period": period, "phase": turn * period} for period in periods for turn in _TURNS
-        )
+        return tuple({"period": x, "phase": phase * x} for x in periods for phase in _PHASES)
 
     def grid(self, ranges: Ranges) -> tuple[dict[str, float], ...]:
-        longest = min(0.5 * ranges.excursion, _COARSEST * ranges.turn)
-        periods = [longest / n for n in _WAVES if longest > 0.0]
-        return tuple(
-            {"period": period, "phase": turn * period} for period in periods for turn in (0.0, 0.25)
-        )
+        longest = min(0.5 * ranges.excursion, _LONGEST * ranges.turn)
+        periods = [longest / n for n in _DIVISORS if longest > 0.0]
+        return tuple({"period": x, "phase": phase * x} for x in periods for phase in _PHASES[:2])
 
     def blend(
         self, sizes: tuple[float, float], settings: tuple[Mapping[str, float], Mapping[str, float]]
@@ -139,12 +135,11 @@ class Cogging(JointEffect):
 
 class ConstantForce(JointEffect):
     r"""
-    The same force at all times and everywhere.
+    The same force at all times and positions.
 
     .. math:: \tau = \tau_0
 
-    At a hinge whose axis is level, a mass off the axis makes a force that turns with the joint:
-    that is gravity, not this.
+    An eccentric mass at a horizontal hinge is not such a force: its torque varies with the angle.
 
     Source: Janot, Gautier and Brunot, *Data set and reference models of EMPS*, Workshop on
     Nonlinear System Identification Benchmarks, 2019 (the offset).

@@ -1,4 +1,4 @@
-"""What happens to a measurement on its way out of the plant."""
+"""Effects between the plant and the measurement."""
 
 from typing import TYPE_CHECKING
 
@@ -17,11 +17,12 @@ if TYPE_CHECKING:
 
 class SensorBias(SensorEffect):
     r"""
-    A sensor is off by a constant.
+    A sensor has a constant error.
 
     .. math:: y' = y + \beta
 
-    Of an angle that is measured as cosine and sine, a wrong zero is no such bias: it turns both.
+    A wrong zero of an angle that is measured as cosine and sine is not such a bias: it rotates
+    both.
 
     Source: *International vocabulary of metrology*, JCGM 200:2012, 4.20 (instrumental bias).
     """
@@ -71,9 +72,9 @@ class SensorDelay(Delayed, SensorEffect):
 
     .. math:: y'(t) = y(t - d)
 
-    Linear between samples, so the delay need not be a multiple of the control interval; on a sample
-    the derivative is that of a growing delay. Before an episode, the channel is taken to have stood
-    where it was found: there one report tells the truth, and later it does not.
+    Samples are interpolated linearly, so the delay need not be a multiple of the control interval;
+    at a multiple the derivative is the one-sided one towards larger delays. Before an episode the
+    channel is assumed constant, so the first report is exact.
 
     Source: Åström and Murray, *Feedback Systems*, Princeton University Press 2021, section 10.
 
@@ -91,7 +92,7 @@ class SensorDelay(Delayed, SensorEffect):
         return jnp.full(self.remembered(twin.dt), measured)
 
     def sense(self, measured: Scalar, memory: Memory, dt: float, params: Params) -> Scalar:
-        # Whoever moves a state without its memory sees the new one at once.
+        # A state that was changed without its memory is reported without delay.
         values = memory.at[0].set(measured)
         age = params["delay"] / dt
         younger = jnp.clip(jnp.floor(age).astype(int), 0, len(memory) - 2)
@@ -111,9 +112,9 @@ class SignFlip(SensorEffect):
 
     .. math:: y' = \begin{cases} y & f < 1/2 \\ -y & f \ge 1/2 \end{cases}
 
-    There is nothing between right and wrong: the one parameter :math:`f` is a switch, off at 0 and
-    on at 1, and has no derivative. Where the direction of a whole joint is wrong, its position and
-    its velocity are: :func:`reversed_joint` finds the channels.
+    The parameter :math:`f` is a switch, off at 0 and on at 1, without a derivative. If the
+    direction of a joint is wrong, both its position and its velocity are: :func:`reversed_joint`
+    finds the channels.
 
     Source: *International vocabulary of metrology*, JCGM 200:2012, 4.12 (a sensitivity of -1).
     """
@@ -134,13 +135,13 @@ class SignFlip(SensorEffect):
 
 def reversed_joint(twin: "Twin", joint: int | str) -> tuple[SignFlip, ...]:
     """
-    What measures a joint whose direction is taken the wrong way round.
+    The sensor effects of a joint whose direction is reversed.
 
     :param joint: index or name
     :return: a flip for each channel that changes sign with position and velocity of the joint: of a
         pendulum the sine and the speed, and not the cosine
-    :raises EffectError: for a joint that the twin does not have, or a channel that neither keeps
-        its size nor changes its sign alone, which no flip of channels can say
+    :raises EffectError: for an unknown joint, or a channel that changes in another way than by its
+        sign
     """
     twin = plant_of(twin)
     names = [each.name for each in twin.joints]
@@ -148,21 +149,18 @@ def reversed_joint(twin: "Twin", joint: int | str) -> tuple[SignFlip, ...]:
     if not isinstance(index, int) or not 0 <= index < len(names):
         raise EffectError(f"{twin.name} has no joint {joint!r}. It has: {', '.join(names)}.")
     state = twin.initial(jax.random.key(0), twin.params)
-    # Some position and velocity at which no channel is zero by chance.
+    # A position and a velocity at which no channel is zero by chance.
     q, v = 0.3 + 0.1 * jnp.arange(len(names)), 0.7 - 0.1 * jnp.arange(len(names))
     turned = [x.at[index].multiply(-1.0) for x in (q, v)]
-    here, there = (
+    before, after = (
         np.asarray(twin.observe(state._replace(q=x, v=y), twin.params)) for x, y in ((q, v), turned)
     )
-    changed = ~np.isclose(there, here)
-    odd = changed & np.isclose(there, -here)
+    changed = ~np.isclose(after, before)
+    odd = changed & np.isclose(after, -before)
+    channels = np.array([channel.name for channel in twin.channels])
     if (changed & ~odd).any():
-        mixed = [c.name for c, bad in zip(twin.channels, changed & ~odd, strict=True) if bad]
         raise EffectError(
-            f"Turning {names[index]} round changes more than the sign of: {', '.join(mixed)}. "
-            "A flip of channels cannot say that."
+            f"Reversing {names[index]} changes more than the sign of: "
+            f"{', '.join(channels[changed & ~odd])}. SignFlip cannot represent that."
         )
-    flips = (
-        SignFlip(c.name, flipped=1.0) for c, flip in zip(twin.channels, odd, strict=True) if flip
-    )
-    return tuple(flips)
+    return tuple(SignFlip(name, flipped=1.0) for name in channels[odd].tolist())

@@ -1,4 +1,4 @@
-"""What several effects share: nonlinearities with the right derivative at null, and delays."""
+"""Shared by several effects: nonlinearities with the right derivative at null, and delays."""
 
 import dataclasses
 import math
@@ -22,8 +22,8 @@ def dry_friction(
     r"""
     A force against the motion, :math:`-l \tanh(v / w)` with :math:`w = \max(w_0, l h / I)`.
 
-    The sign function is smoothed over :math:`w`, which never falls below what a sub-step can stop.
-    The error is below 0.5 % of the force at speeds above :math:`3 w`, and all of it at standstill.
+    The sign function is smoothed over :math:`w`, at least the speed that a sub-step can stop. The
+    error is below 0.5 % of the force at speeds above :math:`3 w`, and 100 % at standstill.
 
     :param level: size of the force when sliding [N m] or [N], not negative
     :param standstill: :math:`w_0`, speed below which it is smoothed [rad/s] or [m/s]
@@ -35,10 +35,10 @@ def dry_friction(
 
 def beyond(x: Scalar, limit: Scalar | float) -> Scalar:
     """
-    By how much ``x`` lies beyond ``limit`` on either side; zero in between.
+    The excess of ``x`` over ``limit`` on either side; zero in between.
 
-    At a limit of zero it is ``x``, and so are its derivatives: one by ``x``, at zero too, and minus
-    the sign of ``x`` by a growing limit.
+    At a limit of zero it equals ``x``, with a derivative of one by ``x``, at zero, too, and of
+    minus the sign of ``x`` by a growing limit.
 
     :param limit: not negative
     """
@@ -71,5 +71,5 @@ class Delayed(Effect):
         super().__init__(where, **values)
 
     def remembered(self, dt: float) -> int:
-        """:return: number of control intervals that a memory must hold, the present one included"""
+        """:return: number of control intervals that a memory must hold, including the current"""
         return math.ceil(self.longest / dt - 1e-9) + 1

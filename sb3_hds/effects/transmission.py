@@ -1,4 +1,4 @@
-"""What lies between a motor and its load: the joint's inertia is split into two."""
+"""Transmissions between a motor and its load, which split a joint's inertia in two."""
 
 import abc
 from typing import TYPE_CHECKING
@@ -13,31 +13,29 @@ from sb3_hds.errors import EffectError
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
 
-# Default share of a joint's inertia that turns with the motor: gears are commonly chosen
-# so that the motor's inertia, seen from the load, equals the load's.
+# Default share of a joint's inertia that turns with the motor: gears are commonly chosen so that
+# the motor's reflected inertia equals the load's.
 _MATCHED = 0.5
 
 
 class Transmission(ForceEffect):
     r"""
-    Lets a motor move relative to its load, where the twin has one rigid joint.
+    Abstract: a motor that moves relative to its load, where the twin has one rigid joint.
 
-    The twin knows one inertia :math:`I` of the joint; the share :math:`\sigma` of it belongs to the
-    motor. With the motor's lead :math:`\delta` over the load (whose position the twin's joint is),
-    and :math:`s` the torque between the two,
+    The share :math:`\sigma` of the joint's inertia :math:`I` belongs to the motor. With the lead
+    :math:`\delta` of the motor over the load (whose position is that of the joint), and the torque
+    :math:`s` between the two,
 
     .. math::
         \sigma (1 - \sigma) I\,\ddot\delta = \tau_\text{act} - \sigma I \dot v_\text{rigid} - s,
         \qquad \tau = -\sigma I\,\ddot\delta
 
     where :math:`\dot v_\text{rigid}` is the acceleration of the twin without effects. The force
-    :math:`\tau` on the joint is what the motor's own motion takes away, so the momentum of both
-    together is that of the rigid joint. Forces of other effects are taken to act on both sides, in
-    proportion to their inertia: they move the two together. Where the joint's inertia depends on
-    the position of other joints, so does the motor's here.
+    :math:`\tau` on the joint is the reaction to the motor's own motion, so the total momentum is
+    that of the rigid joint. Forces of other effects act on both sides in proportion to their
+    inertia. If the joint's inertia depends on the position of other joints, so does the motor's.
 
-    The memory is :math:`\delta` and its speed. An episode starts with neither, as if nothing had
-    been transmitted before.
+    The memory is :math:`\delta` and its speed; both are zero at the start of an episode.
     """
 
     held = True
@@ -60,31 +58,31 @@ class Transmission(ForceEffect):
     ) -> Memory:
         """
         :param memory: ``lead`` [rad] and its ``speed`` [rad/s] at the start of a sub-step
-        :param drive: what would turn the motor against the load if nothing held them together [N m]
-        :param inertia: of that motion [kg m2]
+        :param drive: torque that turns the motor against the load, without :math:`s` [N m]
+        :param inertia: of the relative motion [kg m2]
         :param h: length of the sub-step [s]
-        :return: the same at its end
+        :return: the memory at the end of the sub-step
         """
 
     def memory(self, twin: "Twin") -> Memory:
         return {"lead": jnp.zeros(()), "speed": jnp.zeros(())}
 
     def force(self, moment: Moment, index: int, memory: Memory, params: Params) -> Force:
-        inertia, _ = self._apart(moment, index)
+        inertia, _ = self._relative_motion(moment, index)
         after = self.advance(moment, index, memory, params)
         torque = self.motor_share * inertia * (memory["speed"] - after["speed"]) / moment.h
         return jnp.zeros_like(moment.v).at[index].set(torque)
 
     def advance(self, moment: Moment, index: int, memory: Memory, params: Params) -> Memory:
-        inertia, drive = self._apart(moment, index)
+        inertia, drive = self._relative_motion(moment, index)
         share = self.motor_share
         return self.lead(memory, drive, share * (1.0 - share) * inertia, moment.h, params)
 
-    def _apart(self, moment: Moment, index: int) -> tuple[Scalar, Scalar]:
-        """The joint's effective inertia, and what drives the motor apart from the load."""
+    def _relative_motion(self, moment: Moment, index: int) -> tuple[Scalar, Scalar]:
+        """The joint's effective inertia, and the torque that turns the motor against the load."""
         unit = jnp.zeros_like(moment.v).at[index].set(1.0)
-        given = jnp.stack([unit, moment.actuator - moment.load], -1)
-        by_unit, rigid = solve_spd(moment.mass_matrix, given)[index]
+        forces = jnp.stack([unit, moment.actuator - moment.load], -1)
+        by_unit, rigid = solve_spd(moment.mass_matrix, forces)[index]
         inertia = 1.0 / by_unit
         return inertia, moment.actuator[index] - self.motor_share * inertia * rigid
 
@@ -96,16 +94,15 @@ class JointElasticity(Transmission):
     .. math:: s = k\,\delta + d\,\dot\delta, \qquad
               \omega_r^2 = \frac{k}{\sigma (1 - \sigma) I}
 
-    with :math:`\delta, \sigma, I` of :class:`~sb3_hds.effects.transmission.Transmission`, and
-    :math:`\omega_r` the frequency at which the two swing against each other. That motion is solved
-    by the implicit midpoint rule, which is stable at any sub-step: where :math:`\omega_r h \gg 1`
-    the frequency is not resolved, but neither does the energy grow.
+    with :math:`\delta, \sigma, I` of :class:`~sb3_hds.effects.transmission.Transmission`, and the
+    resonance frequency :math:`\omega_r` of motor against load. The relative motion is integrated by
+    the implicit midpoint rule, which is stable at any sub-step: if :math:`\omega_r h \gg 1`, the
+    frequency is not resolved, but the energy does not grow.
 
-    :math:`k = 0` stands for a rigid joint, without a spring in it: as with every effect, zero is
-    absence. True rigidity is :math:`k \to \infty`, which is no number; so the effect jumps at zero,
-    and the smallest :math:`k` is the softest joint. At zero there is no derivative, and a search
-    has to begin at a stiffness. A :math:`d` without :math:`k` does nothing. Of :math:`k` and
-    :math:`\sigma`, the resonance tells one number only.
+    :math:`k = 0` stands for a rigid joint, because every effect is absent at its null. The effect
+    therefore jumps at zero, and the smallest :math:`k` is the softest joint. At zero there is no
+    derivative, and a search must start at a positive stiffness. A :math:`d` without :math:`k` has
+    no effect. The resonance determines only one combination of :math:`k` and :math:`\sigma`.
 
     Source: De Luca and Book, *Robots with flexible elements*, Springer Handbook of Robotics 2008,
     section 13.1.1; Spong, *Modeling and control of elastic joint robots*, Journal of Dynamic
@@ -141,12 +138,10 @@ class Backlash(Transmission):
     .. math:: |\delta| \le g / 2, \qquad
               s = 0 \ \text{ inside the gap}
 
-    with :math:`\delta` of :class:`~sb3_hds.effects.transmission.Transmission`. Inside the gap the
-    motor does not reach the load. At its ends the two move together, as the rigid joint does; they
-    meet without rebound, so energy is lost and never gained (Moreau's time stepping: first order in
-    the sub-step). Teeth that bend or bounce are not simulated.
-
-    An episode starts in the middle of the gap.
+    with :math:`\delta` of :class:`~sb3_hds.effects.transmission.Transmission`. At the ends of the
+    gap motor and load move together, as the rigid joint does; they meet without rebound, so energy
+    is lost and never gained (Moreau's time stepping: first order in the sub-step). Elastic or
+    bouncing teeth are not simulated. An episode starts in the middle of the gap.
 
     Source: Nordin and Gutman, *Controlling mechanical systems with backlash: a survey*, Automatica
     38(10), 2002, section 2.

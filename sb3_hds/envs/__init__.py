@@ -4,11 +4,9 @@ Environments made from twins, and the twins that mirror environments.
 Names are imported on first use, so that registering our ids imports neither jax nor torch.
 """
 
-from typing import TYPE_CHECKING
+from sb3_hds.lazy import lazy_imports
 
-from sb3_hds.lazy import lazily
-
-if TYPE_CHECKING:
+with lazy_imports(__name__):
     from sb3_hds.envs.ground_truth import true_twin
     from sb3_hds.envs.mirror import check_mirrors, twin_of
     from sb3_hds.envs.registration import register_environments
@@ -33,19 +31,3 @@ __all__ = [
     "twin_of",
     "verify_mirror",
 ]
-
-lazily(
-    __name__,
-    {
-        "tasks.constant_reward": ("ConstantReward",),
-        "tasks.elastic_quadruped": ("ElasticQuadruped",),
-        "ground_truth": ("true_twin",),
-        "tasks.inverted_pendulum_friction": ("InvertedPendulumFriction",),
-        "mirror": ("check_mirrors", "twin_of"),
-        "tasks.pendulum_real": ("PendulumReal",),
-        "registration": ("register_environments",),
-        "twin_env": ("TwinEnv",),
-        "twin_vec_env": ("TwinVecEnv",),
-        "verify": ("verify_mirror",),
-    },
-)

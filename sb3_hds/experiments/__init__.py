@@ -4,11 +4,9 @@ Measured effects of a change: several seeds, paired start states, confidence int
 Names are imported on first use.
 """
 
-from typing import TYPE_CHECKING
+from sb3_hds.lazy import lazy_imports
 
-from sb3_hds.lazy import lazily
-
-if TYPE_CHECKING:
+with lazy_imports(__name__):
     from sb3_hds.experiments.policy_gain import PolicyGain, measure_policy_gain
     from sb3_hds.experiments.returns import returns_of
     from sb3_hds.experiments.robustness import PERTURBATIONS, Robustness, measure_robustness
@@ -21,12 +19,3 @@ __all__ = [
     "measure_robustness",
     "returns_of",
 ]
-
-lazily(
-    __name__,
-    {
-        "policy_gain": ("PolicyGain", "measure_policy_gain"),
-        "returns": ("returns_of",),
-        "robustness": ("PERTURBATIONS", "Robustness", "measure_robustness"),
-    },
-)

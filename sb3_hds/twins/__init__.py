@@ -1,5 +1,6 @@
-"""The library of twins, one file per system, and their registry."""
+"""The library of twins, one file per system, and its registry."""
 
+from sb3_hds.core import Twin
 from sb3_hds.twins.check import check
 from sb3_hds.twins.check_result import CheckItem, TwinCheck
 from sb3_hds.twins.environments.acrobot import Acrobot
@@ -20,26 +21,6 @@ from sb3_hds.twins.rigs.furuta import Furuta
 from sb3_hds.twins.rigs.linear_axis import LinearAxis
 from sb3_hds.twins.rigs.rig import Rig
 from sb3_hds.twins.rigs.servo_pendulum import ServoPendulum
-
-for _twin in (
-    Acrobot,
-    CartPole,
-    DoublePendulum,
-    Duffing,
-    FreePendulum,
-    Furuta,
-    InvertedDoublePendulum,
-    InvertedPendulum,
-    InvertedPendulumFriction,
-    LinearAxis,
-    MountainCar,
-    PayloadPendulum,
-    Pendulum,
-    PendulumReal,
-    ServoPendulum,
-):
-    register(_twin)
-register(MechanismTwin, listed=False)
 
 __all__ = [
     "Acrobot",
@@ -74,3 +55,8 @@ __all__ = [
     "write_model",
     "write_models",
 ]
+
+for _name in __all__:
+    _twin = globals()[_name]
+    if isinstance(_twin, type) and issubclass(_twin, Twin) and hasattr(_twin, "name"):
+        register(_twin, listed=_twin is not MechanismTwin)

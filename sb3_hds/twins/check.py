@@ -8,19 +8,20 @@ import numpy as np
 from jaxtyping import Array
 
 from sb3_hds.core import AnalyticTwin, Params, State, Twin
-from sb3_hds.core.contract import check_methods, check_now
+from sb3_hds.core.contract import check_layer, check_methods
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.errors import TwinError
 from sb3_hds.twins import registry
-from sb3_hds.twins.check_result import CheckItem, TwinCheck
+from sb3_hds.twins.check_result import CheckItem, TwinCheck, outcomes
 from sb3_hds.twins.mechanics import ROUNDING, Points, check_mechanics, precision
 
 _N_STARTS, _N_STEPS = 16, 20
 _N_POINTS = 64  # at which the terms of the equation of motion are compared
 _OWN, _GENERIC = 0, 1  # the first two variants of the parameters
 _TINY = 1e-300
-# In the order in which they are blamed: a later one uses what an earlier one returns.
+_REST = "everything else, before that is fixed"
+# In the order in which they are reported: later ones use what earlier ones return.
 _METHODS = (
     "step", "observe", "infer", "observe(infer(obs))", "terminated", "reward", "planning_reward"
 )  # fmt: skip
@@ -37,22 +38,22 @@ def check(twin: Twin | type[Twin] | str, *, seed: int = 0) -> TwinCheck:
     - each parameter and each command has an effect
     - the mass matrix is symmetric and positive definite
     - gravity and springs have a potential: :math:`\partial c(q, 0) / \partial q` is symmetric
-    - the forces of inertia do no work, :math:`v^T (\tfrac12 \dot M v - c(q, v) + c(q, 0)) = 0`, or
-      less than none, where the twin has damping of its own
+    - inertial forces do no work, :math:`v^T (\tfrac12 \dot M v - c(q, v) + c(q, 0)) = 0`; with
+      damping, the left side is negative
     - without actuators, the energy after :meth:`step` decreases by the work of damping, up to an
       error that shrinks with the sub-step
 
-    Everything is evaluated in double precision at random states, commands and values of parameters
-    within a ``scale`` of the twin's own. Values of masses and lengths cannot be
-    checked this way: ``verify_mirror`` compares with an environment, ``calibrate`` with data.
+    Everything is evaluated in double precision at random states, commands and parameters within a
+    ``scale`` of the twin's own. Values of masses and lengths cannot be checked this way:
+    ``verify_mirror`` compares with an environment, ``calibrate`` with data.
 
-    Source of the third last and second last: Spong, Hutchinson and Vidyasagar, *Robot Modeling and
-    Control*, 2006, section 7.5 (passivity).
+    Source: Spong, Hutchinson and Vidyasagar, *Robot Modeling and Control*, 2006, section 7.5
+    (passivity), for potential and inertial forces.
 
-    :param twin: a twin, its class, or the name under which one is registered
-    :param seed: of what is drawn
+    :param twin: a twin, its class, or its registered name
+    :param seed: of all random numbers
     :raises NoTwinError: for a name that is not registered
-    :raises TypeError: for what is no twin
+    :raises TypeError: for anything else
     """
     if isinstance(twin, str):
         twin = registry.get(twin)
@@ -61,14 +62,12 @@ def check(twin: Twin | type[Twin] | str, *, seed: int = 0) -> TwinCheck:
         raise TypeError(f"twins.check takes a twin, its class or its name, got {twin!r}.")
     contract = _contract(made)
     if not contract.ok:
-        return TwinCheck(made.name, (contract,), "everything else, before that is mended")
+        return TwinCheck(made.name, (contract,), _REST)
     with jax.enable_x64(True):
         samples = _sampled(made, seed)
         finite = _finite(samples)
         if not finite.ok:
-            return TwinCheck(
-                made.name, (contract, finite), "everything else, before that is mended"
-            )
+            return TwinCheck(made.name, (contract, finite), _REST)
         items = [contract, finite, _inverse(made, samples), _parameters(made, samples)]
         items += [_commands(made, samples)] if made.actuators else []
         plant = plant_of(made)
@@ -83,20 +82,21 @@ def check(twin: Twin | type[Twin] | str, *, seed: int = 0) -> TwinCheck:
 
 class _Samples(NamedTuple):
     """
-    Motions under random commands with several values of the parameters. The first of them are the
-    twin's own, the second all generic, and each of the others differs from the second in one thing.
+    Motions under random commands for several variants of the parameters. The first variant has the
+    twin's own values, the second random ones; each of the others changes one parameter or command
+    of the second.
 
-    :param names: of what differs
+    :param names: of the variants
     :param params: leading axis ``n_variants``
     :param states: after each step, the start first: ``(n_variants, n_starts, n_steps + 1, ...)``
-    :param seen: after each step, what was observed, inferred and earned, by method
+    :param returned: values of each method after each step
     :param smooth: whether the derivatives of each method are finite there
     """
 
     names: tuple[str, ...]
     params: Params
     states: State
-    seen: dict[str, np.ndarray]
+    returned: dict[str, np.ndarray]
     smooth: dict[str, Any]
 
 
@@ -113,20 +113,20 @@ def _sampled(twin: Twin, seed: int) -> _Samples:
     low, high = _limits(twin)
     shape = (_N_STARTS, _N_STEPS, len(low))
     actions = low + rng.uniform(size=shape) * (high - low)
-    every = [actions] * len(variants)
+    actions_of = [actions] * len(variants)
     for i, actuator in enumerate(twin.actuators):
         variants[f"command {actuator.name}"] = generic
-        # Elsewhere within the limits, half their distance away.
-        half = actions[..., i] + 0.5 * (high - low)[i]
-        every.append(actions.copy())
-        every[-1][..., i] = np.where(half > high[i], half - (high - low)[i], half)
+        # Shifted by half the range, within the limits.
+        shifted = actions[..., i] + 0.5 * (high - low)[i]
+        actions_of.append(actions.copy())
+        actions_of[-1][..., i] = np.where(shifted > high[i], shifted - (high - low)[i], shifted)
     params = {name: np.array([values[name] for values in variants.values()]) for name in own}
     seeds = rng.integers(2**31, size=_N_STARTS)
-    return _Samples(tuple(variants), params, *_motions(twin, seeds, params, np.stack(every)))
+    return _Samples(tuple(variants), params, *_motions(twin, seeds, params, np.stack(actions_of)))
 
 
 def _motions(twin: Twin, seeds: np.ndarray, params: Params, actions: np.ndarray) -> Any:
-    """:return: states, what was seen, and whether slopes are finite, one for each step"""
+    """:return: for each step, states, values of methods, and whether derivatives are finite"""
 
     def outcome(state: State, action: Array, params: Params) -> tuple[State, dict[str, Array]]:
         params = {**params, **twin.tensors}
@@ -144,18 +144,18 @@ def _motions(twin: Twin, seeds: np.ndarray, params: Params, actions: np.ndarray)
     def motion(seed: Array, actions: Array, params: Params) -> Any:
         def step(state: State, action: Array) -> Any:
             at = (state, action, params)
-            found, slopes = jax.jvp(outcome, at, jax.tree.map(jnp.ones_like, at))
-            after, seen = found
+            (after, returned), slopes = jax.jvp(outcome, at, jax.tree.map(jnp.ones_like, at))
             over = 1.0 * twin.terminated(after, {**params, **twin.tensors})
-            smooth = {"step": slopes[0], **slopes[1]}
-            return after, (after, seen | {"terminated": over}, jax.tree.map(_all_finite, smooth))
+            smooth = jax.tree.map(_all_finite, {"step": slopes[0], **slopes[1]})
+            return after, (after, returned | {"terminated": over}, smooth)
 
         start = twin.initial(jax.random.key(seed), {**params, **twin.tensors})
         start = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), start)
-        _, (states, seen, smooth) = jax.lax.scan(step, start, actions)
-        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, states), seen, smooth
+        _, (states, *rest) = jax.lax.scan(step, start, actions)
+        states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, states)
+        return states, *rest
 
-    # One axis for variants and starts: two take twice as long to compile.
+    # One axis for variants and starts, because two take twice as long to compile.
     n_variants, n_starts = actions.shape[:2]
     flat = (
         np.tile(seeds, n_variants),
@@ -173,7 +173,7 @@ def _all_finite(values: Array) -> Array:
 
 
 def _moved(twin: Twin, name: str, value: float) -> float:
-    """:return: another value, half a typical deviation away and within the bounds"""
+    """:return: another value within the bounds, half a typical deviation away if possible"""
     parameter = twin.parameters[name]
     for move in (0.5, -0.5, 0.05, -0.05):
         if parameter.lower <= (moved := value + move * parameter.scale) <= parameter.upper:
@@ -182,45 +182,42 @@ def _moved(twin: Twin, name: str, value: float) -> float:
 
 
 def _limits(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
-    """Finite limits of commands: where there are none, as far as gravity pulls, or 1."""
-    far = max(twin.typical_forces(), default=0.0) or 1.0
+    """Limits of commands; infinite ones are replaced by typical forces, or 1."""
+    size = max(twin.typical_forces(), default=0.0) or 1.0
     low, high = np.array([(a.low, a.high) for a in twin.actuators], float).reshape(-1, 2).T
-    low, high = (
-        np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - far, -far)),
-        np.where(np.isfinite(high), high, np.where(np.isfinite(low), low + far, far)),
+    return (
+        np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - size, -size)),
+        np.where(np.isfinite(high), high, np.where(np.isfinite(low), low + size, size)),
     )
-    return low, high
 
 
 # --- checks of any twin
 
 
 def _contract(twin: Twin) -> CheckItem:
-    name = "shapes and dtypes"
+    passed, failed = outcomes("shapes and dtypes")
     try:
         check_methods(twin)
         for layer in reversed(list(layers_of(twin))):
-            check_now(layer)
+            check_layer(layer)
     except TwinError as error:
-        return CheckItem(name, False, str(error))
-    return CheckItem(name, True, "what every method returns, in single and double precision")
+        return failed(str(error))
+    return passed("what every method returns, in single and double precision")
 
 
 def _finite(samples: _Samples) -> CheckItem:
-    name = "finite"
-    values = {"step": np.concatenate(samples.states[:2], -1)[:, :, 1:], **samples.seen}
+    passed, failed = outcomes("finite")
+    values = {"step": np.concatenate(samples.states[:2], -1)[:, :, 1:], **samples.returned}
     values = {method: values[method] for method in _METHODS}
     for variant, label in enumerate(samples.names):
-        # At a bound, one step: a motion may be too fast there for the twin's sub-step.
+        # One step at a bound: motions may be too fast there for the twin's sub-step.
         n_steps = 1 if " = " in label else _N_STEPS
         for method, found in values.items():
             bad = ~np.isfinite(found[variant, :, :n_steps]).reshape(_N_STARTS, n_steps, -1)
             if bad.any():
                 after = int(bad.any((0, 2)).argmax()) + 1
                 where = f"with {label}" if n_steps == 1 else f"with {_variant_in_words(label)}"
-                return CheckItem(
-                    name,
-                    False,
+                return failed(
                     f"{method} is not finite after {after} of {_N_STEPS} steps {where}",
                     f"Move the bound of {label.partition(' = ')[0]} to where the twin still works."
                     if n_steps == 1
@@ -234,15 +231,11 @@ def _finite(samples: _Samples) -> CheckItem:
         )
     ]
     if steep:
-        return CheckItem(
-            name,
-            False,
+        return failed(
             f"the derivative of {steep[0]} is not finite at a state that is visited",
             "A root or a norm has none at zero: write sqrt(x**2 + 1e-12), or jnp.where before it.",
         )
-    return CheckItem(
-        name,
-        True,
+    return passed(
         f"{_N_STARTS} motions of {_N_STEPS} steps under random commands, their derivatives, and a "
         "step with each parameter at its bounds",
     )
@@ -254,18 +247,16 @@ def _variant_in_words(variant: str) -> str:
 
 
 def _inverse(twin: Twin, samples: _Samples) -> CheckItem:
-    name = "infer inverts observe"
+    passed, failed = outcomes("infer inverts observe")
     obs, again, inferred = (
-        samples.seen[key][_GENERIC].reshape(_N_STARTS * _N_STEPS, -1)
+        samples.returned[key][_GENERIC].reshape(_N_STARTS * _N_STEPS, -1)
         for key in ("observe", "observe(infer(obs))", "infer")
     )
     size = np.maximum(np.abs(obs).max(0), _TINY)
     error = (np.abs(again - obs) / size).max(0)
     worst = int(error.argmax())
     if not error.max() < ROUNDING:
-        return CheckItem(
-            name,
-            False,
+        return failed(
             f"observe(infer(obs)) differs from obs in '{twin.channels[worst].name}' by "
             f"{error[worst]:.1%} of its largest value",
             "infer has to put each channel back where observe took it from.",
@@ -276,48 +267,43 @@ def _inverse(twin: Twin, samples: _Samples) -> CheckItem:
         f"{what} of {joint.name}"
         for what, before, after in parts
         for joint, b, a in zip(twin.joints, before.T, after.T, strict=True)
-        if _apart(a - b, what == "position" and joint.unit == "rad") > ROUNDING * np.abs(b).max()
+        if _largest(a - b, what == "position" and joint.unit == "rad") > ROUNDING * np.abs(b).max()
     ]
     found = f"observe(infer(obs)) equals obs {precision(error.max())}"
-    return CheckItem(
-        name, True, f"{found}; infer does not recover {', '.join(lost)}" if lost else found
-    )
+    return passed(f"{found}; infer does not recover {', '.join(lost)}" if lost else found)
 
 
-def _apart(change: np.ndarray, angle: bool) -> float:
-    """The largest change, of an angle up to whole turns."""
+def _largest(change: np.ndarray, angle: bool) -> float:
+    """The largest absolute change; of an angle, modulo full turns."""
     turns = np.round(change / (2.0 * np.pi)) if angle else 0.0
     return float(np.abs(change - 2.0 * np.pi * turns).max())
 
 
 def _parameters(twin: Twin, samples: _Samples) -> CheckItem:
-    name = "parameters"
+    passed, failed = outcomes("parameters")
     effects = {parameter: _effect(samples, f"value {parameter}") for parameter in twin.parameters}
     outside = [n for n, p in twin.parameters.items() if not p.lower <= twin.values[n] <= p.upper]
     if outside:
-        return CheckItem(name, False, f"out of bounds: {', '.join(outside)}", "Set other values.")
+        return failed(f"out of bounds: {', '.join(outside)}", "Set other values.")
     idle = [parameter for parameter, effect in effects.items() if not effect > ROUNDING]
     if idle:
-        return CheckItem(
-            name,
-            False,
+        return failed(
             f"without effect on motion, observation and reward: {', '.join(idle)}",
             "Methods take values from params, never from self. Leave out what nothing uses.",
         )
-    return CheckItem(name, True, f"within their bounds, and each has an effect{_least(effects)}")
+    return passed(f"within their bounds, and each has an effect{_least(effects)}")
 
 
 def _commands(twin: Twin, samples: _Samples) -> CheckItem:
+    passed, failed = outcomes("commands")
     effects = {a.name: _effect(samples, f"command {a.name}") for a in twin.actuators}
     idle = [actuator for actuator, effect in effects.items() if not effect > ROUNDING]
     if idle:
-        return CheckItem(
-            "commands",
-            False,
+        return failed(
             f"without effect on the motion: {', '.join(idle)}",
             "Use each entry of the action in actuate, within its limits low and high.",
         )
-    return CheckItem("commands", True, f"each has an effect{_least(effects)}")
+    return passed(f"each has an effect{_least(effects)}")
 
 
 def _least(effects: dict[str, float]) -> str:
@@ -328,12 +314,12 @@ def _least(effects: dict[str, float]) -> str:
 
 
 def _effect(samples: _Samples, variant: str) -> float:
-    """How much it changes at most, as a share of how large that is."""
+    """The largest change relative to the second variant, as a share of the values' size."""
     i = samples.names.index(variant)
     moved = np.concatenate(samples.states[:2], -1)
-    every = [moved, *samples.seen.values()] if variant.startswith("value") else [moved]
+    compared = [moved, *samples.returned.values()] if variant.startswith("value") else [moved]
     found = 0.0
-    for values in every:
+    for values in compared:
         values = values.reshape(*values.shape[:3], -1)
         size = np.abs(values[[i, _GENERIC]]).max((0, 1, 2))
         change = np.abs(values[i] - values[_GENERIC]).max((0, 1))
@@ -342,7 +328,7 @@ def _effect(samples: _Samples, variant: str) -> float:
 
 
 def _points(plant: AnalyticTwin, samples: _Samples, seed: int) -> Points:
-    """Positions that were visited, hinges turned anywhere, and speeds as large as those seen."""
+    """Visited positions with hinges rotated at random, and velocities of the visited size."""
     rng = np.random.default_rng(seed + 1)
     params = {}
     for name, parameter in plant.parameters.items():

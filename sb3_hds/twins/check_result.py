@@ -2,6 +2,8 @@
 
 import dataclasses
 import textwrap
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 _WIDTH = 80
@@ -11,10 +13,10 @@ class CheckItem(NamedTuple):
     """
     One check.
 
-    :param name: what was checked
+    :param name: of the checked property
     :param ok: whether it passed
-    :param found: how it was checked, and with which number
-    :param way_out: what to do where it failed; else empty
+    :param found: how it was checked, and the measured number
+    :param way_out: what to do if it failed
     """
 
     name: str
@@ -23,13 +25,21 @@ class CheckItem(NamedTuple):
     way_out: str = ""
 
 
+def outcomes(name: str) -> tuple[Callable[..., CheckItem], Callable[..., CheckItem]]:
+    """
+    :param name: of the checked property
+    :return: constructors of its item if the check passed, and if it failed
+    """
+    return partial(CheckItem, name, True), partial(CheckItem, name, False)
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class TwinCheck:
     """
     Result of :func:`~sb3_hds.twins.check`. Prints itself.
 
     :param twin: its name
-    :param items: one for each check, in the order in which they were made
+    :param items: one for each check, in order
     :param skipped: what was not checked, and why
     """
 

@@ -1,4 +1,4 @@
-"""Which twins exist, by name and by environment id."""
+"""The registry of twins, by name and by environment id."""
 
 import importlib
 import inspect
@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sb3_hds.core import Effect, Twin, seen_through
-from sb3_hds.core.belief import belief_over
-from sb3_hds.core.contract import check_methods, missing_methods
+from sb3_hds.core.belief import belief_from_spec
+from sb3_hds.core.contract import check_methods
 from sb3_hds.errors import NoTwinError, TwinError, did_you_mean
 
 _TWINS: dict[str, type[Twin]] = {}
@@ -17,14 +17,14 @@ _VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 def register(twin: type[Twin], *, listed: bool = True) -> type[Twin]:
     """
-    Make a twin known under its ``name`` and its ``env_id``. Usable as a class decorator.
+    Register a twin under its ``name`` and its ``env_id``. Usable as a class decorator.
 
     :param twin: a concrete subclass of ``Twin``
-    :param listed: whether its name is all that it takes; otherwise only :func:`from_spec` makes it
+    :param listed: whether :func:`names` lists it; False if it cannot be made from its name alone
     :return: the class itself
     :raises TypeError: for anything but a subclass of ``Twin``
     :raises ValueError: if another class has the name or the id already
-    :raises TwinError: if a method is missing, or returns another shape or dtype than it has to
+    :raises TwinError: if a method is missing, or returns a wrong shape or dtype
     """
     if not (isinstance(twin, type) and issubclass(twin, Twin)):
         raise TypeError(
@@ -41,9 +41,9 @@ def register(twin: type[Twin], *, listed: bool = True) -> type[Twin]:
                 f"'{key}' is already the twin {other.__qualname__}. "
                 f"Choose another name for {twin!r}."
             )
-    if missing := missing_methods(twin):
+    if missing := sorted(getattr(twin, "__abstractmethods__", ())):
         raise TwinError(
-            f"{twin.__name__} lacks {', '.join(missing)}: implement what is abstract in "
+            f"{twin.__name__} lacks {', '.join(missing)}: implement the abstract methods of "
             f"{twin.__mro__[1].__name__}."
         )
     if _has_defaults(twin):
@@ -55,7 +55,7 @@ def register(twin: type[Twin], *, listed: bool = True) -> type[Twin]:
 
 
 def _has_defaults(twin: type[Twin]) -> bool:
-    """Whether it can be made without arguments; what cannot is checked on first use."""
+    """Whether it can be made without arguments; otherwise it is checked on first use."""
     arguments = inspect.signature(twin).parameters.values()
     needed = [a for a in arguments if a.default is a.empty and a.kind not in _VARIADIC]
     return hasattr(twin, "dt") and not needed
@@ -73,19 +73,18 @@ def all_ids() -> list[str]:
 
 def get(name_or_env_id: str) -> type[Twin]:
     """
-    :param name_or_env_id: also ``"module:Name"``, as in ``gymnasium.make``: the module, which
-        registers the twin, is imported first
+    :param name_or_env_id: also ``"module:Name"``, as in ``gymnasium.make``: imports the module
+        first, which registers the twin
     :return: the class registered under a name or an environment id
-    :raises NoTwinError: if there is none; the message lists what exists and how to add one's own
+    :raises NoTwinError: if there is none; the message lists all and explains how to add one
     """
     name = str(name_or_env_id)
     module, colon, inner = name.rpartition(":")
     if colon:
         return _imported(module, inner)
-    try:
-        return _TWINS[name]
-    except KeyError:
-        raise NoTwinError(_how_to_add_one(name)) from None
+    if name not in _TWINS:
+        raise NoTwinError(_how_to_add_one(name))
+    return _TWINS[name]
 
 
 def make(name_or_env_id: str, **settings: Any) -> Twin:
@@ -94,8 +93,8 @@ def make(name_or_env_id: str, **settings: Any) -> Twin:
         the module that registers it
     :param settings: values of parameters, options of the twin, ``dt`` [s], ``substeps``
     :raises NoTwinError: if there is no such twin
-    :raises ParameterError: for a setting that the twin does not have, or a value out of bounds
-    :raises TwinError: for a twin whose methods do not return what they have to
+    :raises ParameterError: for an unknown setting, or a value out of bounds
+    :raises TwinError: if a method returns a wrong shape or dtype
     """
     twin = get(name_or_env_id)(**settings)
     check_methods(twin)
@@ -105,10 +104,9 @@ def make(name_or_env_id: str, **settings: Any) -> Twin:
 def from_env(env: Any) -> Twin:
     """
     :param env: an environment made by ``gymnasium.make``, wrapped or not
-    :return: its twin, with the parameters that the environment was made with; the very twin that
-        it simulates if it is made of one
+    :return: its twin, with the parameters of the environment; if it simulates a twin, that one
     :raises NoTwinError: if its id has no twin
-    :raises TwinError: for a twin whose methods do not return what they have to
+    :raises TwinError: if a method returns a wrong shape or dtype
     """
     own = getattr(env.unwrapped, "twin", None)
     if isinstance(own, Twin):
@@ -125,44 +123,44 @@ def from_spec(spec: Mapping[str, Any], effects: Iterable[type[Effect]] = ()) -> 
     The inverse of ``Twin.to_spec``.
 
     :param spec: plain data
-    :param effects: the classes among which the effects of the spec are found by name
-    :raises NoTwinError: if the twin or one of its effects is not known here
+    :param effects: the classes that the names of effects stand for
+    :raises NoTwinError: for an unknown twin or effect
     """
     twin = make(spec["twin"], **spec["options"], **spec["parameters"])
     known = {effect.name: effect for effect in effects}
     missing = {part["effect"] for part in spec.get("effects", ())} - set(known)
     if missing:
         raise NoTwinError(
-            f"The twin '{spec['twin']}' was saved with effects that are not known here: {missing}."
+            f"The twin '{spec['twin']}' was saved with unknown effects: {', '.join(missing)}."
         )
     attached = [
         known[part["effect"]](part["where"], **part.get("options", {}), **part["parameters"])
         for part in spec.get("effects", ())
     ]
     twin = twin.extend(*attached) if attached else twin
-    twin = belief_over(twin, spec["belief"]) if "belief" in spec else twin
+    twin = belief_from_spec(twin, spec["belief"]) if "belief" in spec else twin
     return seen_through(twin, spec.get("transforms", ()))
 
 
 def _imported(module: str, name: str) -> type[Twin]:
-    """:return: the twin that is registered under the name once the module is imported"""
+    """Import a module and return the twin that it registers under a name."""
     wanted = f"{module}:{name}"
     if not (name and all(part.isidentifier() for part in module.split("."))):
-        raise NoTwinError(f"A twin of one's own is asked for as module:Name, got '{wanted}'.")
+        raise NoTwinError(f"Name a twin of your own as module:Name, got '{wanted}'.")
     try:
         importlib.import_module(module)
     except ImportError as error:
         raise NoTwinError(
-            f"There is no twin for '{wanted}': the module cannot be imported ({error}). It has to "
-            "be installed, or its folder on the path of Python (PYTHONPATH)."
+            f"There is no twin for '{wanted}': the module cannot be imported ({error}). Install "
+            "it, or add its folder to PYTHONPATH."
         ) from error
     if name in _TWINS:
         return _TWINS[name]
     theirs = [key for key, twin in _TWINS.items() if twin.__module__ == module]
     raise NoTwinError(
         f"There is no twin for '{wanted}': module '{module}' registers "
-        f"{', '.join(sorted(theirs)) or 'no twin'}, not '{name}'. What counts is the 'name' or "
-        "'env_id' of a class that is decorated with @twins.register."
+        f"{', '.join(sorted(theirs)) or 'no twin'}, not '{name}'. Use the 'name' or 'env_id' of a "
+        "class that is decorated with @twins.register."
     )
 
 

@@ -4,11 +4,9 @@ Gymnasium wrappers for learning on robots, in rooms by what they act on.
 Names are imported on first use: a loop on a robot needs few of them, and neither JAX nor PyTorch.
 """
 
-from typing import TYPE_CHECKING
+from sb3_hds.lazy import lazy_imports
 
-from sb3_hds.lazy import lazily
-
-if TYPE_CHECKING:
+with lazy_imports(__name__):
     from sb3_hds.wrappers.actions.continuity import ContinuityCost
     from sb3_hds.wrappers.actions.cpg_prior import CPGPrior
     from sb3_hds.wrappers.actions.filters import ActionDelay, ActionRateLimit, LowPassAction
@@ -60,27 +58,3 @@ __all__ = [
     "check_task",
     "check_truncation",
 ]
-
-lazily(
-    __name__,
-    {
-        "actions.continuity": ("ContinuityCost",),
-        "actions.cpg_prior": ("CPGPrior",),
-        "actions.filters": ("ActionDelay", "ActionRateLimit", "LowPassAction"),
-        "actions.scale": ("ActionScale",),
-        "checks.task": ("TaskReport", "check_task"),
-        "checks.truncation": ("TruncationReport", "check_truncation"),
-        "episodes.ends": ("InfiniteHorizon", "TerminateToTruncate", "TruncateToTerminate"),
-        "episodes.manual_reset": ("ManualReset",),
-        "hardware.perturb": ("Perturb",),
-        "hardware.real_time": ("RealTime", "Timing"),
-        "hardware.record": ("Record",),
-        "observations.history": ("HistoryObservation",),
-        "observations.show_joints": ("ShowJoints",),
-        "observations.time_aware": ("TimeAware",),
-        "safety.barrier": ("JointLimitBarrier",),
-        "safety.shared_control": ("Phase", "SharedControlTemplate"),
-        "safety.shield": ("ActionShield",),
-        "vec_env": ("GymnasiumVecEnv",),
-    },
-)

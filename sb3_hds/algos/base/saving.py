@@ -27,7 +27,7 @@ from sb3_hds.algos.base.construct import (
 )
 from sb3_hds.algos.base.files import by_names, damage_reported, name_of, refuse_damaged, write_whole
 from sb3_hds.algos.base.policy_file import described
-from sb3_hds.core.numerics.kept_programs import keep_programs
+from sb3_hds.core.numerics.compilation import keep_programs
 from sb3_hds.errors import EnvironmentMismatchError
 
 if TYPE_CHECKING:

@@ -1,1 +1,1 @@
-"""Integrators, small linear systems, and how programs are compiled."""
+"""Integrators, small linear systems, and compilation by XLA."""

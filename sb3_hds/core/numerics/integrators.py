@@ -1,8 +1,9 @@
 """
 Integrators of ``dq/dt = v, dv/dt = a(q, v)`` over one sub-step, as in the mirrored environments.
 
-An integrator takes the acceleration, ``q``, ``v``, the step and a function that limits velocities.
-Twins with quaternions also pass ``displace``, which moves a position by a velocity times a time.
+An integrator takes the acceleration, ``q``, ``v``, the step size and a function that limits
+velocities. Twins with quaternions also pass ``displace``, which moves a position by a velocity
+times a time.
 """
 
 import operator
@@ -56,18 +57,18 @@ def rk4(
     """
     The classical Runge-Kutta method; MuJoCo's ``RK4`` is the same.
 
-    The four stages are one loop: written out, they take four times as long to compile.
+    The four stages are a loop: unrolled, they take four times as long to compile.
     """
     ahead = jnp.array([0.0, 0.5, 0.5, 1.0], v.dtype) * h
-    share = jnp.array([1.0, 2.0, 2.0, 1.0], v.dtype) * (h / 6.0)
+    weights = jnp.array([1.0, 2.0, 2.0, 1.0], v.dtype) * (h / 6.0)
 
-    def stage(carry, now):
-        q_dot, v_dot, way, v_new = carry
-        delay, weight = now
-        q_there, v_there = displace(q, delay * q_dot), v + delay * v_dot
-        a = acceleration(q_there, v_there)
-        return (v_there, a, way + weight * v_there, v_new + weight * a), None
+    def stage(carry, at):
+        q_dot, v_dot, displacement, v_new = carry
+        delay, weight = at
+        v_stage = v + delay * v_dot
+        a = acceleration(displace(q, delay * q_dot), v_stage)
+        return (v_stage, a, displacement + weight * v_stage, v_new + weight * a), None
 
-    still = jnp.zeros_like(v)
-    (_, _, way, v_new), _ = jax.lax.scan(stage, (still, still, still, v), (ahead, share))
-    return displace(q, way), limit(v_new)
+    zero = jnp.zeros_like(v)
+    (_, _, displacement, v_new), _ = jax.lax.scan(stage, (zero, zero, zero, v), (ahead, weights))
+    return displace(q, displacement), limit(v_new)

@@ -1,4 +1,4 @@
-"""Linear algebra on matrices of a handful of rows that XLA vectorises over a batch."""
+"""Solvers for small symmetric systems that XLA vectorises over a batch."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-# Rows up to which loops are written out: beyond, they take a multiple of the time to compile. And
-# rows up to which there are loops at all: LAPACK's batched solvers spread over threads, for which
-# two programs that run at once can wait for ever, and cost several times as much for a batch of 64.
+# Matrices up to this size are solved by unrolled loops, which compile slowly beyond it; up to the
+# second size by loops. LAPACK's batched solvers cost several times as much for a batch of 64, and
+# use threads: two programs that run at the same time can deadlock.
 _UNROLLED, _LOOPED = 4, 16
 
 
@@ -17,7 +17,7 @@ class Factor(NamedTuple):
     """
     Factors of a symmetric positive definite matrix :math:`L D L^T`.
 
-    :param lower: :math:`L`, shape ``(n, n)``; what is not below its diagonal is not read
+    :param lower: :math:`L`, shape ``(n, n)``; only the entries below the diagonal are read
     :param pivot: the diagonal of :math:`D`, shape ``(n,)``
     """
 
@@ -27,32 +27,32 @@ class Factor(NamedTuple):
 
 def uses_lapack(n: int) -> bool:
     """
-    :param n: rows of matrices
-    :return: whether LAPACK solves them; two such programs must not run at once
+    :param n: number of rows
+    :return: whether LAPACK solves such systems; two such programs must not run at the same time
     """
     return n > _LOOPED
 
 
 def solve_spd(
-    matrix: Float[Array, "n n"], right: Float[Array, "n *k"], least_pivot: float | None = None
+    matrix: Float[Array, "n n"], right: Float[Array, "n *k"], min_pivot: float | None = None
 ) -> Float[Array, "n *k"]:
     """
     Solve ``matrix @ x = right`` for a symmetric positive definite matrix.
 
     :param matrix: symmetric positive definite, shape ``(n, n)``; not checked
     :param right: shape ``(n,)`` or ``(n, k)``
-    :param least_pivot: raise smaller pivots to this value, so that an indefinite matrix is replaced
-        by a positive definite one near it; None leaves them
+    :param min_pivot: raise smaller pivots to this value, so that an indefinite matrix is replaced
+        by a positive definite one near it; None: not
     :return: the solution, in the shape of ``right``
     """
     n = matrix.shape[0]
-    if n > _UNROLLED and least_pivot is None:
+    if n > _UNROLLED and min_pivot is None:
         return solve_factored(factorised(matrix), right)
     lower: dict[tuple[int, int], Array] = {}
     pivot: list[Array] = []
     for j in range(n):
         rest = matrix[j, j] - sum(lower[j, k] ** 2 * pivot[k] for k in range(j))
-        pivot.append(rest if least_pivot is None else jnp.maximum(rest, least_pivot))
+        pivot.append(rest if min_pivot is None else jnp.maximum(rest, min_pivot))
         for i in range(j + 1, n):
             shared = sum(lower[i, k] * lower[j, k] * pivot[k] for k in range(j))
             lower[i, j] = (matrix[i, j] - shared) / pivot[j]
@@ -66,9 +66,7 @@ def solve_spd(
 
 
 def factorised(matrix: Float[Array, "n n"]) -> Factor:
-    """
-    :param matrix: symmetric positive definite; not checked
-    """
+    """:param matrix: symmetric positive definite; not checked"""
     n = matrix.shape[0]
     if uses_lapack(n):
         root = lax.linalg.cholesky(matrix, symmetrize_input=False)
@@ -77,15 +75,15 @@ def factorised(matrix: Float[Array, "n n"]) -> Factor:
 
     def column(j: Any, now: tuple[Array, Factor]) -> tuple[Array, Factor]:
         rest, found = now
-        whole = lax.dynamic_index_in_dim(rest, j, 1, keepdims=False)
-        pivot = lax.dynamic_index_in_dim(whole, j, 0, keepdims=False)
-        share = jnp.where(below > j, whole / pivot, 0.0)
-        lower = lax.dynamic_update_index_in_dim(found.lower, share, j, 1)
+        current = lax.dynamic_index_in_dim(rest, j, 1, keepdims=False)
+        pivot = lax.dynamic_index_in_dim(current, j, 0, keepdims=False)
+        scaled = jnp.where(below > j, current / pivot, 0.0)
+        lower = lax.dynamic_update_index_in_dim(found.lower, scaled, j, 1)
         pivots = lax.dynamic_update_index_in_dim(found.pivot, pivot, j, 0)
-        return rest - share[:, None] * whole[None, :], Factor(lower, pivots)
+        return rest - scaled[:, None] * current[None, :], Factor(lower, pivots)
 
-    nothing = Factor(jnp.zeros_like(matrix), jnp.zeros_like(matrix[0]))
-    return lax.fori_loop(0, n, column, (matrix, nothing))[1]
+    empty = Factor(jnp.zeros_like(matrix), jnp.zeros_like(matrix[0]))
+    return lax.fori_loop(0, n, column, (matrix, empty))[1]
 
 
 def solve_factored(factor: Factor, right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
@@ -97,14 +95,9 @@ def solve_factored(factor: Factor, right: Float[Array, "n *k"]) -> Float[Array, 
     n = len(factor.pivot)
     columns, pivot = right.reshape(n, -1), factor.pivot[:, None]
     if uses_lapack(n):
-        below = partial(
-            lax.linalg.triangular_solve,
-            factor.lower,
-            left_side=True,
-            lower=True,
-            unit_diagonal=True,
-        )
-        return below(below(columns) / pivot, transpose_a=True).reshape(right.shape)
+        kind = {"left_side": True, "lower": True, "unit_diagonal": True}
+        solve = partial(lax.linalg.triangular_solve, factor.lower, **kind)
+        return solve(solve(columns) / pivot, transpose_a=True).reshape(right.shape)
 
     def forwards(j: Any, x: Array) -> Array:
         own = lax.dynamic_index_in_dim(x, j, 0)

@@ -1,26 +1,12 @@
 """
 Measured data: the type, its files, and where it comes from.
 
-Names are imported on first use: a loop on a robot needs few of them, and neither JAX nor PyTorch.
+Names are imported on first use, so that a control loop on a robot needs neither JAX nor PyTorch.
 """
 
-from typing import TYPE_CHECKING
+from sb3_hds.lazy import lazy_imports
 
-from sb3_hds.lazy import lazily
-
-if TYPE_CHECKING:
-    from sb3_hds.core.trajectories.log_reader import read_logs_by
+with lazy_imports(__name__):
     from sb3_hds.core.trajectories.trajectories import Trajectories
 
-__all__ = [
-    "Trajectories",
-    "read_logs_by",
-]
-
-lazily(
-    __name__,
-    {
-        "log_reader": ("read_logs_by",),
-        "trajectories": ("Trajectories",),
-    },
-)
+__all__ = ["Trajectories"]

@@ -8,8 +8,8 @@ import numpy as np
 
 from sb3_hds.errors import TrajectoryError
 
+#: relative difference below which two sampling rates count as equal
 SAME_RATE = 1e-3
-"""Relative difference below which two sampling rates count as equal."""
 
 
 def check_dt(dt: Any) -> float:
@@ -40,7 +40,7 @@ def check_episodes(
     :param obs: one array of shape ``(T + 1, n_obs)`` per episode
     :param actions: one array of shape ``(T, n_act)`` per episode
     :return: both as float64
-    :raises TrajectoryError: for a wrong shape, number, or content; says which array and sample
+    :raises TrajectoryError: for a wrong shape, number or content, with the array and the sample
     """
     obs = [_matrix("obs", i, x, "(T + 1, n_obs)") for i, x in enumerate(obs)]
     actions = [_matrix("actions", i, x, "(T, n_act)") for i, x in enumerate(actions)]
@@ -76,8 +76,8 @@ def pad(
     obs: Sequence[np.ndarray], actions: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    :return: observations, shape ``(n, T + 1, n_obs)``, the last one repeated; actions, shape
-        ``(n, T, n_act)``, zeros appended; and which steps are real, shape ``(n, T)``
+    :return: observations, shape ``(n, T + 1, n_obs)``, padded with the last one; actions, shape
+        ``(n, T, n_act)``, padded with zeros; and a mask that is False for padding, shape ``(n, T)``
     """
     lengths = np.array([len(u) for u in actions])
     longest = int(lengths.max())
@@ -90,27 +90,28 @@ def resample(
     obs: np.ndarray, actions: np.ndarray, ratio: float, n_steps: int, angles: Sequence[int] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    One episode at another interval: actions held, observations interpolated linearly.
+    Resample one episode: actions are held, observations interpolated linearly.
 
     :param obs: shape ``(T + 1, n_obs)``
     :param actions: shape ``(T, n_act)``
     :param ratio: new interval by old interval
     :param n_steps: length of the result, at most ``T / ratio``
-    :param angles: columns of ``obs`` with angles wrapped to [-pi, pi); they turn the shorter way
+    :param angles: columns of ``obs`` with angles wrapped to [-pi, pi); interpolated along the
+        shorter way
     :return: observations, shape ``(n_steps + 1, n_obs)``, and actions, shape ``(n_steps, n_act)``
     """
     time = np.arange(n_steps + 1) * ratio  # [old steps]
-    whole = np.round(time)
-    time = np.where(np.abs(time - whole) < 1e-6, whole, time)
-    left = np.minimum(time.astype(int), len(actions) - 1)
-    weight = (time - left)[:, None]
-    before, after = obs[left], obs[left + 1]
+    rounded = np.round(time)
+    time = np.where(np.abs(time - rounded) < 1e-6, rounded, time)
+    step = np.minimum(time.astype(int), len(actions) - 1)
+    weight = (time - step)[:, None]
+    before, after = obs[step], obs[step + 1]
     columns = list(angles)
     turn = after[:, columns] - before[:, columns]
     after[:, columns] -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
     mixed = (1.0 - weight) * before + weight * after
     mixed[:, columns] -= 2.0 * np.pi * np.floor(mixed[:, columns] / (2.0 * np.pi) + 0.5)
-    return mixed, actions[left[:-1]]
+    return mixed, actions[step[:-1]]
 
 
 def _matrix(argument: str, i: int, array: Any, shape: str) -> np.ndarray:

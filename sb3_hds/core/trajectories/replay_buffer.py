@@ -1,4 +1,4 @@
-"""Episodes from a replay buffer of Stable-Baselines3, by its attributes alone."""
+"""Episodes from a replay buffer of Stable-Baselines3, without importing it."""
 
 from typing import Any
 
@@ -11,19 +11,19 @@ def episodes_in(
     buffer: Any, action_space: Any = None, scaled: bool = True, only_finite: bool = False
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[tuple[int, int]]]:
     """
-    Follow each environment through the ring, oldest step first.
+    Read the ring buffer by environment, oldest step first.
 
-    An episode ends where ``dones`` says so (timeouts included), and where the next stored
-    observation is not the one that the step led to: there the environment was reset from outside.
-    With ``optimize_memory_usage`` SB3 overwrites what an episode's last action led to, and the
-    oldest observation of a full ring: those steps are left out.
+    An episode ends at ``dones`` (timeouts included), and where the next stored observation is not
+    the step's next observation: there the environment was reset from outside. With
+    ``optimize_memory_usage`` SB3 overwrites an episode's last next observation, and the oldest
+    observation of a full ring: those steps are dropped.
 
     :param buffer: anything with the attributes of SB3's ``ReplayBuffer``
     :param action_space: the box that actions are scaled back to; default: the buffer's own
     :param scaled: whether stored actions are scaled to [-1, 1], as SB3's algorithms store them
-    :param only_finite: whether to leave out steps with a value that is not finite, and to cut there
+    :param only_finite: drop steps with a value that is not finite, and split the episode there
     :return: observations, each ``(T + 1, n_obs)``; actions, each ``(T, n_act)``; and where each
-        begins: steps since the oldest one in the ring, and the environment
+        episode begins: steps since the oldest one in the ring, and the environment
     :raises TrajectoryError: for spaces other than boxes of one axis, and for an empty buffer
     """
     if not isinstance(buffer.observations, np.ndarray) or buffer.observations.ndim != 3:
@@ -32,10 +32,13 @@ def episodes_in(
             f"got observations of {buffer.observation_space}."
         )
     shared = bool(getattr(buffer, "optimize_memory_usage", False))
-    order = _oldest_first(buffer, shared)
+    # Oldest first.
+    order = np.arange(buffer.pos)
+    if buffer.full:
+        order = (buffer.pos + np.arange(int(shared), buffer.buffer_size)) % buffer.buffer_size
+    following = (order + 1) % buffer.buffer_size
     space = buffer.action_space if action_space is None else action_space
     commands = _unscaled(buffer, space, scaled)
-    following = (order + 1) % buffer.buffer_size
     obs, actions, begins = [], [], []
     first = int(shared and buffer.full)
     for env in range(buffer.n_envs):
@@ -61,12 +64,6 @@ def _finite_runs(steps: np.ndarray, before: np.ndarray, after: np.ndarray) -> li
     finite = np.all(np.isfinite(before[steps]) & np.isfinite(after[steps]), axis=1)
     runs = np.split(steps, np.flatnonzero(np.diff(finite.astype(int))) + 1) if len(steps) else []
     return [run for run in runs if finite[run[0] - steps[0]]]
-
-
-def _oldest_first(buffer: Any, shared: bool) -> np.ndarray:
-    if not buffer.full:
-        return np.arange(buffer.pos)
-    return (buffer.pos + np.arange(int(shared), buffer.buffer_size)) % buffer.buffer_size
 
 
 def _unscaled(buffer: Any, space: Any, scaled: bool) -> np.ndarray:

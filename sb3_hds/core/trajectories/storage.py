@@ -1,12 +1,12 @@
-"""Atomic writes of files; arrays are stored without pickle."""
+"""Files: atomic writes, arrays without pickle, and the reader of logs."""
 
-import contextlib
+import io
 import os
 import secrets
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,28 @@ from sb3_hds.errors import TrajectoryError
 
 _SUFFIX = ".npz"
 
+LogReader = Callable[[Any, Any], Any]
+
+_log_reader: LogReader | None = None
+
+
+def register_log_reader(reader: LogReader) -> None:
+    """
+    Set what ``Trajectories.load`` reads logs with: ``core`` does not import ``data``.
+
+    :param reader: takes files and columns as ``Trajectories.load`` does
+    """
+    global _log_reader
+    _log_reader = reader
+
+
+def log_reader() -> LogReader | None:
+    """:return: the reader; None before ``sb3_hds.data`` is imported"""
+    return _log_reader
+
 
 def check_target(path: str | os.PathLike[str]) -> None:
-    """:raises OSError: if there is no folder to write that file in, or a folder of its name"""
+    """:raises OSError: if the folder of that file does not exist, or it is a folder itself"""
     target = Path(path)
     if not target.parent.is_dir():
         raise FileNotFoundError(
@@ -28,18 +47,23 @@ def check_target(path: str | os.PathLike[str]) -> None:
         raise IsADirectoryError(f"{target} is a folder. Name a file.")
 
 
-def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
+def write_bytes(path: str | os.PathLike[str], content: bytes, *, durable: bool = False) -> Path:
     """
     Write under a temporary name in the same folder, then rename: a reader never sees half a file.
 
     :param path: a file of that name is replaced
+    :param durable: flush it to the disk before renaming, so that it survives a loss of power
     :return: the path of the file
     :raises OSError: if the file cannot be written; an older file there is left as it was
     """
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
     try:
-        temporary.write_bytes(content)
+        with temporary.open("xb") as file:
+            file.write(content)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
@@ -48,7 +72,7 @@ def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
 
 def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:
     """
-    Write under a temporary name in the same folder, then rename: a reader never sees half a file.
+    Write arrays as :func:`write_bytes` does.
 
     :param path: ``.npz`` is appended where it is missing, as numpy does
     :param arrays: by name; none may hold objects
@@ -58,30 +82,22 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:
     target = Path(path)
     if target.suffix != _SUFFIX:
         target = target.with_name(target.name + _SUFFIX)
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
+    compressed = io.BytesIO()
+    np.savez_compressed(compressed, **arrays)
     try:
-        try:
-            with temporary.open("xb") as file:
-                np.savez_compressed(file, **arrays)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, target)
-        finally:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
+        return write_bytes(target, compressed.getvalue(), durable=True)
     except OSError as error:
         raise TrajectoryError(
             f"'{target}' could not be written: {error.strerror}. "
             "The folder must exist and be writable, with space left on the disk."
         ) from error
-    return target
 
 
 def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """
     :param path: as given to :func:`write_npz`
     :return: all arrays, by name
-    :raises TrajectoryError: if there is no such file, or if it is damaged or of another kind
+    :raises TrajectoryError: if the file is missing, damaged or of another kind
     """
     source = Path(path)
     if not source.exists() and source.with_name(source.name + _SUFFIX).exists():
@@ -115,26 +131,3 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             f"'{source}' is damaged or was not written by Trajectories.save ({reason}). "
             "Restore it from a copy, or record it again."
         ) from error
-
-
-def read_marked(path: str | os.PathLike[str], kind: str, version: int) -> dict[str, np.ndarray]:
-    """
-    :param path: as given to :func:`write_npz`
-    :param kind: that the file must carry as ``format``
-    :param version: the latest that can be read
-    :return: all arrays, by name
-    :raises TrajectoryError: as :func:`read_npz`, and for another format or a later version
-    """
-    stored = read_npz(path)
-    if stored.get("format", np.array("")).tolist() != kind:
-        raise TrajectoryError(
-            f"'{path}' was not written by Trajectories.save; it holds: {', '.join(stored)}. "
-            "Say what that is, columns={'time': NAME, 'obs': [NAME, ...], 'actions': [NAME, "
-            "...]}, or build the data with Trajectories.from_arrays."
-        )
-    if stored.get("version", np.array(0)) > version:
-        raise TrajectoryError(
-            f"'{path}' is of version {stored['version']}, this sb3_hds reads up to "
-            f"{version}. Upgrade sb3_hds."
-        )
-    return stored

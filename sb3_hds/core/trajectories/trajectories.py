@@ -21,9 +21,8 @@ from sb3_hds.core.trajectories.episodes import (
     resample,
     same_interval,
 )
-from sb3_hds.core.trajectories.log_reader import log_reader
 from sb3_hds.core.trajectories.replay_buffer import episodes_in
-from sb3_hds.core.trajectories.storage import read_marked, write_npz
+from sb3_hds.core.trajectories.storage import log_reader, read_npz, write_npz
 from sb3_hds.errors import TrajectoryError
 
 _FORMAT, _VERSION = "sb3_hds.Trajectories", 1
@@ -39,15 +38,15 @@ class Trajectories:
     :meth:`from_replay_buffer` or :meth:`load`. They are double precision NumPy arrays, and a JAX
     pytree whose leaves are the arrays; ``dt`` and ``conditions`` are static.
 
-    :param obs: shape ``(n, T + 1, n_obs)``; after the end of an episode, its last row again
-    :param actions: shape ``(n, T, n_act)``; after the end of an episode, zeros
-    :param mask: True where step k is real, and with it ``obs[:, k + 1]``; shape ``(n, T)``
+    :param obs: shape ``(n, T + 1, n_obs)``; padded with the last row of the episode
+    :param actions: shape ``(n, T, n_act)``; padded with zeros
+    :param mask: False for padding: of step k and of ``obs[:, k + 1]``; shape ``(n, T)``
     :param dt: sampling interval [s]
-    :param conditions: a label for what was different, one per trajectory: a load, a gain
-    :param origin: number of the recorded trajectory that each is a part of, shape ``(n,)``; windows
+    :param conditions: a label of each trajectory's conditions, such as a load or a gain
+    :param origin: index of the recording that each trajectory is part of, shape ``(n,)``; windows
         of one recording share it, because their errors are correlated (one cluster)
-    :param report: what reading logs changed, a ``data.Reading``; a note that goes with selections
-        and windows, but neither into files nor through transformations of JAX
+    :param report: what reading logs changed, a ``data.Reading``; kept by selections and windows,
+        but neither saved nor passed through transformations of JAX
     :raises TrajectoryError: if these do not fit together
     """
 
@@ -108,7 +107,7 @@ class Trajectories:
         condition: str = "replay buffer",
     ) -> "Trajectories":
         """
-        Every episode in a replay buffer of Stable-Baselines3, finished or not, oldest first.
+        All episodes in a replay buffer of Stable-Baselines3, finished or not, oldest first.
 
         Observations are those of the environment: SB3 stores them before ``VecNormalize``.
 
@@ -116,8 +115,8 @@ class Trajectories:
         :param dt: control interval of the environment [s]
         :param action_space: the box that actions are scaled back to; default: the buffer's own
         :param scaled: whether stored actions are scaled to [-1, 1], as SB3's algorithms store them
-        :param only_finite: leave out steps with a value that is not finite, and cut there
-        :param condition: label for all of them
+        :param only_finite: drop steps with a value that is not finite, and split the episode there
+        :param condition: label of all episodes
         :raises TrajectoryError: for spaces other than boxes of one axis, and for an empty buffer
         """
         obs, actions, _ = episodes_in(replay_buffer, action_space, scaled, only_finite)
@@ -126,15 +125,14 @@ class Trajectories:
     @classmethod
     def concatenate(cls, parts: Iterable["Trajectories"]) -> "Trajectories":
         """
-        :param parts: sampled at the same interval, to 0.1 %, with the same channels; that of the
-            first is kept
-        :raises TrajectoryError: for other intervals or channels, or if there are no parts
+        :param parts: with the same channels, and the same interval to 0.1 %: that of the first
+        :raises TrajectoryError: for different intervals or channels, or without parts
         """
         parts = list(parts)
         for part in parts:
             if not same_interval(part.dt, parts[0].dt):
                 raise TrajectoryError(
-                    f"Only trajectories of one dt can be joined, got {parts[0].dt} s and "
+                    f"Only trajectories of equal dt can be joined, got {parts[0].dt} s and "
                     f"{part.dt} s. Resample first: part.resample(dt={parts[0].dt})."
                 )
         episodes = [part.episode(i) for part in parts for i in range(len(part))]
@@ -147,9 +145,9 @@ class Trajectories:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
-        Write one ``.npz`` file, without pickle; a file of that name is replaced as a whole.
+        Write one ``.npz`` file, without pickle; a file of that name is replaced.
 
-        :param path: ``.npz`` is appended where it is missing
+        :param path: ``.npz`` is appended if missing
         :return: the path of the file
         :raises TrajectoryError: if the file cannot be written
         """
@@ -165,18 +163,18 @@ class Trajectories:
         columns: Any = None,
     ) -> "Trajectories":
         """
-        Read what :meth:`save` wrote, recordings, and logs of any kind.
+        Read files of :meth:`save`, recordings and logs.
 
         Row k of a log is observation k, with the action that acts from then on. Uneven time stamps
-        are resampled; what that changed is warned of and stays in ``report``.
+        are resampled; a warning and ``report`` say what that changed.
 
         :param files: path, or pattern with ``*``, or several: ``.npz``, ``.jsonl`` (a recording),
-            ``.csv``, ``.parquet``, ``.mat``, ``.h5``, ``.json``, a bag of ROS; or ``minari:`` and
-            the name of a data set
-        :param columns: what the columns of a log mean, as a dict or the path of a yml file; not
-            needed for what :meth:`save` or a recorder wrote
-        :raises TrajectoryError: if there is no such file, if it is damaged or of another kind, if
-            a column is missing, holds no finite numbers, or if time decreases
+            ``.csv``, ``.parquet``, ``.mat``, ``.h5``, ``.json``, a ROS bag; or ``minari:`` and the
+            name of a data set
+        :param columns: the meaning of the columns of a log, as a dict or the path of a yml file;
+            not needed for files of :meth:`save` or of a recorder
+        :raises TrajectoryError: if a file is missing, damaged or of another kind, if a column is
+            missing or holds no finite numbers, or if time decreases
         """
         reader = log_reader()
         if columns is None and isinstance(files, str | os.PathLike):
@@ -193,7 +191,18 @@ class Trajectories:
     @classmethod
     def _load_npz(cls, path: str | os.PathLike[str]) -> "Trajectories":
         """One file that :meth:`save` wrote."""
-        stored = read_marked(path, _FORMAT, _VERSION)
+        stored = read_npz(path)
+        if stored.get("format", np.array("")).tolist() != _FORMAT:
+            raise TrajectoryError(
+                f"'{path}' was not written by Trajectories.save; it holds: {', '.join(stored)}. "
+                "Say what that is, columns={'time': NAME, 'obs': [NAME, ...], 'actions': [NAME, "
+                "...]}, or build the data with Trajectories.from_arrays."
+            )
+        if stored.get("version", np.array(0)) > _VERSION:
+            raise TrajectoryError(
+                f"'{path}' is of version {stored['version']}, this sb3_hds reads up to "
+                f"{_VERSION}. Upgrade sb3_hds."
+            )
         try:
             lengths = stored["lengths"].tolist()
             obs = [x[: n + 1] for x, n in zip(stored["obs"], lengths, strict=True)]
@@ -213,7 +222,7 @@ class Trajectories:
         return len(self.mask)
 
     def __getitem__(self, index: Any) -> "Trajectories":
-        """:return: those that an integer, a slice, a mask or an array of integers selects"""
+        """:param index: integer, slice, mask or array of integers"""
         chosen = np.atleast_1d(np.arange(len(self))[index])
         if not len(chosen):
             raise TrajectoryError(f"The index {index!r} selects none of {len(self)} trajectories.")
@@ -234,7 +243,7 @@ class Trajectories:
 
     @property
     def n_steps(self) -> int:
-        """Number of steps of all trajectories together."""
+        """Total number of steps."""
         return int(self.mask.sum())
 
     @property
@@ -248,17 +257,18 @@ class Trajectories:
         return self.actions.shape[2]
 
     def episode(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """:return: observations ``(T + 1, n_obs)`` and actions ``(T, n_act)`` of one, unpadded"""
+        """:return: observations ``(T + 1, n_obs)`` and actions ``(T, n_act)``, without padding"""
         n = int(self.lengths[i])
         return self.obs[i, : n + 1], self.actions[i, :n]
 
     def windows(self, length: int, stride: int | None = None) -> "Trajectories":
         """
-        Cut into windows of equal length without padding.
+        Cut into windows of equal length, without padding.
 
         :param length: steps per window
         :param stride: steps from one window to the next; default: ``length``, without overlap
-        :return: the windows in order of trajectory and time; ``origin`` says where each is from
+        :return: the windows in order of trajectory and time, with the ``origin`` of their
+            trajectory
         :raises TrajectoryError: if no trajectory is long enough
         """
         stride = length if stride is None else stride
@@ -272,7 +282,7 @@ class Trajectories:
         if not cuts:
             raise TrajectoryError(
                 f"No trajectory has {length} steps; the longest has {self.lengths.max()}. "
-                "Ask for shorter windows."
+                "Choose shorter windows."
             )
         source, start = np.array(cuts).T
         steps = start[:, None] + np.arange(length + 1)
@@ -292,14 +302,14 @@ class Trajectories:
         seed: int = 0,
     ) -> tuple["Trajectories", "Trajectories"]:
         """
-        Two disjoint parts that share no recording, or no condition.
+        Split at random into two parts that share no recording, or no condition.
 
-        :param fraction: share of the recordings or conditions that the first part gets; each part
-            gets at least one
+        :param fraction: share of the recordings or conditions in the first part; each part gets at
+            least one
         :param by: ``"trajectory"`` keeps windows of one recording together; ``"condition"`` keeps
-            everything with one label together
+            trajectories with one label together
         :param seed: of the draw
-        :raises TrajectoryError: if there are fewer than two groups to share out
+        :raises TrajectoryError: for fewer than two recordings or conditions
         """
         if by not in ("trajectory", "condition") or not 0.0 < fraction < 1.0:
             raise TrajectoryError(
@@ -311,7 +321,7 @@ class Trajectories:
         if len(groups) < 2:
             raise TrajectoryError(
                 f"A split by {by} needs at least two of them, got {len(groups)} among "
-                f"{len(self)} trajectories. Record more, or cut the recording up yourself."
+                f"{len(self)} trajectories. Record more, or split the recording yourself."
             )
         n_first = min(max(round(fraction * len(groups)), 1), len(groups) - 1)
         drawn = np.random.default_rng(seed).permutation(groups)[:n_first]
@@ -322,13 +332,12 @@ class Trajectories:
         """
         Change the sampling interval: actions are held, observations interpolated linearly.
 
-        Where the new interval is the longer one, of the actions within it only the first remains:
-        this is right as long as they are equal. A rest shorter than one new interval is dropped.
+        A longer interval keeps only the first of the actions within it, which is exact if they are
+        equal. A remainder shorter than one new interval is dropped.
 
         :param dt: new sampling interval [s]
-        :param angles: columns of ``obs`` that hold angles wrapped to [-pi, pi); they turn the
-            shorter way from sample to sample. Without it, a jump at the seam is filled with values
-            that the joint never had.
+        :param angles: columns of ``obs`` with angles wrapped to [-pi, pi), which are interpolated
+            along the shorter way; otherwise a jump by a full turn would be interpolated, too
         :raises TrajectoryError: if a trajectory is shorter than ``dt``
         """
         ratio = check_dt(dt) / self.dt
@@ -347,11 +356,11 @@ class Trajectories:
 
     def __repr__(self) -> str:
         lengths = np.sort(self.lengths)
-        spread = f"{lengths[0]}" if lengths[0] == lengths[-1] else f"{lengths[0]} to {lengths[-1]}"
+        range_ = f"{lengths[0]}" if lengths[0] == lengths[-1] else f"{lengths[0]} to {lengths[-1]}"
         counts = [f"{label!r} ({n})" for label, n in Counter(self.conditions).items()]
         more = f", and {len(counts) - 4} more" if len(counts) > 4 else ""
         return (
-            f"Trajectories: {len(self)} of {spread} steps, "
+            f"Trajectories: {len(self)} of {range_} steps, "
             f"{self.n_steps} steps or {self.n_steps * self.dt:.4g} s in all at dt = {self.dt:g} s\n"
             f"  channels: {self.n_obs} observed, {self.n_act} commanded\n"
             f"  conditions: {', '.join(counts[:4])}{more}"
@@ -359,7 +368,7 @@ class Trajectories:
 
 
 def _is_npz(path: Path) -> bool:
-    """Whether it names one file that :meth:`Trajectories.save` may have written."""
+    """Whether it is the path of a single ``.npz`` file, with or without the suffix."""
     stored = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
     return stored.is_file() or (path.suffix == ".npz" and not glob.has_magic(str(path)))
 
@@ -371,13 +380,13 @@ def _unzip(
 
 
 def _flatten(data: Trajectories) -> tuple[Any, tuple[float, tuple[str, ...]]]:
-    """Leaves with their keys, and what is static."""
+    """Leaves with their keys, and the static fields."""
     leaves = tuple((jax.tree_util.GetAttrKey(name), getattr(data, name)) for name in _LEAVES)
     return leaves, (data.dt, data.conditions)
 
 
 def _unflatten(static: tuple[float, tuple[str, ...]], leaves: Iterable[Any]) -> Trajectories:
-    """Skip the checks: under ``vmap`` and ``tree.map``, leaves can be any object."""
+    """Without checks: under ``vmap`` and ``tree.map``, leaves can be any object."""
     data = object.__new__(Trajectories)
     names = (*_LEAVES, "dt", "conditions", "report")
     for name, value in zip(names, (*leaves, *static, None), strict=True):

@@ -1,1 +1,1 @@
-"""What a wrapper does to actions and observations, for an environment and for its twin alike."""
+"""Transforms of actions and observations, shared by environments and twins."""

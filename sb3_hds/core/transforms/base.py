@@ -1,4 +1,4 @@
-"""Interfaces of transforms: what a wrapper does to actions and observations, as pure functions."""
+"""Interfaces of transforms: the pure functions that wrappers apply to actions and observations."""
 
 import abc
 import dataclasses
@@ -7,22 +7,22 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core.signals import Actuator, Channel
+from sb3_hds.core.declarations import Actuator, Channel
 from sb3_hds.errors import ParameterError
 
-# Arrays of NumPy or JAX; "outer" is the policy's side of a wrapper, "inner" the side of the plant.
+# Arrays of NumPy or JAX; "outer" is the policy's side of a wrapper, "inner" the plant's side.
 OuterAction: TypeAlias = Float[Any, " outer"]
 InnerAction: TypeAlias = Float[Any, " inner"]
+OuterObs: TypeAlias = Float[Any, " seen"]
 InnerObs: TypeAlias = Float[Any, " obs"]
-Seen: TypeAlias = Float[Any, " seen"]
-Recalled: TypeAlias = Float[Any, " memory"]
+MemoryVector: TypeAlias = Float[Any, " memory"]
 
 
 class Signals(NamedTuple):
     """
-    The commands and the observations of an environment or a twin.
+    The actuators and observation channels of an environment or a twin.
 
-    :param actuators: one for each command
+    :param actuators: one for each entry of the action
     :param channels: one for each entry of the observation
     """
 
@@ -35,10 +35,15 @@ class Signals(NamedTuple):
 
     def rest(self) -> np.ndarray:
         """
-        :return: the admissible command nearest to zero, shape ``(n_act,)``; it acts before an
-            episode
+        :return: the admissible command nearest to zero, which counts as the command before an
+            episode, shape ``(n_act,)``
         """
         return np.clip(0.0, *self.limits())
+
+    def clip(self, command: Float[Any, " act"]) -> Float[Any, " act"]:
+        """:return: the command within the limits of the actuators"""
+        low, high = self.limits()
+        return command.clip(like(command, low), like(command, high))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +52,7 @@ class ObservationTransform(abc.ABC):
     Maps the observation of the wrapped twin to that of the policy.
 
     A subclass is a frozen dataclass whose fields are plain data: it can be saved and compared.
-    ``below`` are the channels of the twin below.
+    ``below`` are the channels of the wrapped twin.
     """
 
     #: the name it is saved under
@@ -56,21 +61,21 @@ class ObservationTransform(abc.ABC):
     @abc.abstractmethod
     def channels(self, below: tuple[Channel, ...]) -> tuple[Channel, ...]:
         """
-        :return: the channels that the policy sees
-        :raises ParameterError: if the transform does not fit the twin below
+        :return: the channels of the policy's observation
+        :raises ParameterError: if the transform does not fit the wrapped twin
         """
 
     @abc.abstractmethod
     def observe(
         self, obs: Float[Array, " inner"], below: tuple[Channel, ...]
     ) -> Float[Array, " outer"]:
-        """:return: what the policy sees"""
+        """:return: the observation of the policy"""
 
     @abc.abstractmethod
     def invert(
         self, obs: Float[Array, " outer"], below: tuple[Channel, ...]
     ) -> Float[Array, " inner"]:
-        """:return: what the twin below reports; the inverse of :meth:`observe`"""
+        """:return: the observation of the wrapped twin; the inverse of :meth:`observe`"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +84,7 @@ class ActionTransform(abc.ABC):
     Maps the action of the policy to the command of the wrapped twin.
 
     A subclass is a frozen dataclass whose fields are plain data: it can be saved and compared.
-    ``below`` are the actuators of the twin below.
+    ``below`` are the actuators of the wrapped twin.
     """
 
     #: the name it is saved under
@@ -89,34 +94,34 @@ class ActionTransform(abc.ABC):
     def actuators(self, below: tuple[Actuator, ...]) -> tuple[Actuator, ...]:
         """
         :return: the actuators that the policy commands
-        :raises ParameterError: if the transform does not fit the twin below
+        :raises ParameterError: if the transform does not fit the wrapped twin
         """
 
     @abc.abstractmethod
     def apply(
         self, action: Float[Array, " outer"], below: tuple[Actuator, ...]
     ) -> Float[Array, " inner"]:
-        """:return: the command for the twin below"""
+        """:return: the command of the wrapped twin"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StatefulTransform(abc.ABC):
     r"""
-    A wrapper with memory :math:`m`, which may look at the observation before it commands:
+    A wrapper with memory :math:`m`, whose command :math:`u` may depend on the observation:
 
-    .. math:: u_k, m_{k+1} = f(a_k, o_k, m_k), \qquad \text{seen: } (o_k, m_k)
+    .. math:: u_k, m_{k+1} = f(a_k, o_k, m_k), \qquad \text{observed: } (o_k, m_k)
 
     A subclass is a frozen dataclass whose fields are plain data: it can be saved and compared. Its
-    methods take NumPy and JAX arrays alike, so that the wrapper of an environment and the twin
-    behind that wrapper run the same code. ``below`` are the signals of what it wraps.
+    methods take NumPy and JAX arrays alike, so that environments and twins run the same code.
+    ``below`` are the signals of the wrapped environment or twin.
 
-    :param observed: whether the policy sees :math:`m_k`; without it the task is no longer Markov,
-        and a twin infers the memory of the start of an episode
+    :param observed: whether the policy observes :math:`m_k`; otherwise the task is not Markov, and
+        a twin infers the memory of the start of an episode
     """
 
     #: the name it is saved under
     name: ClassVar[str]
-    #: whether the memory outlives the episode
+    #: whether the memory is kept from one episode to the next
     persists: ClassVar[bool] = False
 
     observed: bool = True
@@ -129,24 +134,24 @@ class StatefulTransform(abc.ABC):
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         """
         :return: one channel for each entry of the memory
-        :raises ParameterError: if the transform does not fit what lies below
+        :raises ParameterError: if the transform does not fit the signals below
         """
 
     @abc.abstractmethod
     def act(
-        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
-    ) -> tuple[InnerAction, Recalled]:
+        self, action: OuterAction, obs: InnerObs, memory: MemoryVector, below: Signals
+    ) -> tuple[InnerAction, MemoryVector]:
         """
-        :param obs: what is observed below when the action is chosen
+        :param obs: the observation below, from which the action was chosen
         :return: the command, and the memory after it
         """
 
     @abc.abstractmethod
-    def start(self, obs: InnerObs, below: Signals) -> Recalled:
+    def start(self, obs: InnerObs, below: Signals) -> MemoryVector:
         """:return: the memory at the start of an episode that begins with ``obs``"""
 
-    def cost(self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals) -> Any:
-        """:return: the penalty that is subtracted from the reward of this step"""
+    def cost(self, action: OuterAction, obs: InnerObs, memory: MemoryVector, below: Signals) -> Any:
+        """:return: the penalty to subtract from the reward of this step"""
         return 0.0
 
     def actuators(self, below: Signals) -> tuple[Actuator, ...]:
@@ -154,24 +159,32 @@ class StatefulTransform(abc.ABC):
         return below.actuators
 
     def channels(self, below: Signals) -> tuple[Channel, ...]:
-        """:return: the channels that the policy sees"""
-        remembered = self.remembers(below)
-        return below.channels + remembered if self.observed else below.channels
+        """:return: the channels of the policy's observation"""
+        memory = self.remembers(below)
+        return below.channels + memory if self.observed else below.channels
 
     def draw(
         self, key: PRNGKeyArray, obs: Float[Array, " obs"], below: Signals
     ) -> Float[Array, " memory"]:
-        """:return: a memory that an episode of a twin may begin with"""
+        """:return: a random memory with which an episode of a twin begins"""
         return self.start(obs, below)
 
-    def observe(self, obs: InnerObs, memory: Recalled) -> Seen:
-        """:return: what the policy sees"""
+    def observe(self, obs: InnerObs, memory: MemoryVector) -> OuterObs:
+        """:return: the observation of the policy"""
         return namespace(obs).concatenate([obs, memory]) if self.observed else obs
 
-    def infer(self, seen: Seen, below: Signals) -> tuple[InnerObs, Recalled]:
-        """:return: the observation below and the memory; see ``observed``"""
+    def infer(self, seen: OuterObs, below: Signals) -> tuple[InnerObs, MemoryVector]:
+        """:return: the observation below, and the memory; see ``observed``"""
         obs = seen[: len(below.channels)]
         return obs, seen[len(below.channels) :] if self.observed else self.start(obs, below)
+
+    def refuse_unless(self, field: str, allowed: bool, wanted: str) -> None:
+        """:raises ParameterError: with the field, its value and what it must be"""
+        if not allowed:
+            raise ParameterError(
+                f"{type(self).__name__}({field}={getattr(self, field)!r}): {field} must be "
+                f"{wanted}."
+            )
 
 
 def like(array: Any, values: Any) -> Any:
@@ -180,32 +193,8 @@ def like(array: Any, values: Any) -> Any:
 
 
 def namespace(array: Any) -> Any:
-    """:return: ``numpy`` or ``jax.numpy``, wherever the array is from"""
+    """:return: ``numpy`` or ``jax.numpy``, by the type of the array"""
     return array.__array_namespace__()
-
-
-def per_place(transform: StatefulTransform, field: str, n: int, places: str) -> np.ndarray:
-    """
-    :param field: holds one number, or one for each place
-    :return: one number for each of ``n`` places
-    :raises ParameterError: if it has another number of them
-    """
-    values = np.atleast_1d(np.asarray(getattr(transform, field), float))
-    if values.shape not in ((1,), (n,)):
-        raise ParameterError(
-            f"{type(transform).__name__} has {values.size} values of {field}, but there are {n} "
-            f"{places}. Pass one number, or one for each."
-        )
-    return np.broadcast_to(values, (n,))
-
-
-def refuse_unless(transform: StatefulTransform, field: str, allowed: bool, wanted: str) -> None:
-    """:raises ParameterError: naming the field, what it may be and what it is"""
-    if not allowed:
-        raise ParameterError(
-            f"{type(transform).__name__}({field}={getattr(transform, field)!r}): {field} must be "
-            f"{wanted}."
-        )
 
 
 def _hashable(value: Any) -> Any:

@@ -8,25 +8,18 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core.signals import Actuator, Channel
+from sb3_hds.core.declarations import Actuator, Channel
 from sb3_hds.core.transforms.base import (
     InnerAction,
     InnerObs,
+    MemoryVector,
     OuterAction,
-    Recalled,
     Signals,
     StatefulTransform,
     like,
     namespace,
-    refuse_unless,
 )
-from sb3_hds.core.transforms.filters import clipped
-from sb3_hds.core.transforms.oscillators import (
-    AmplitudeState,
-    advance_amplitude,
-    advance_phase,
-    period,
-)
+from sb3_hds.core.transforms.oscillators import advance_amplitude, advance_phase, period
 from sb3_hds.errors import ParameterError
 
 _PER_JOINT = ("amplitude", "offset", "phase", "kp", "kd", "action_range")
@@ -35,33 +28,32 @@ _PER_JOINT = ("amplitude", "offset", "phase", "kp", "kd", "action_range")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Rhythm(StatefulTransform):
     r"""
-    Oscillators :math:`q_i^* = a_i \sin(\theta_i + \varphi_i) + b_i` that a policy adjusts, with
+    Oscillators :math:`q_i^* = a_i \sin(\theta_i + \varphi_i) + b_i` that a policy adjusts by
     actions :math:`\alpha` from -1 to 1.
 
-    All joints share one clock :math:`c`, the share of the cycle that has passed, from 0 to 1.
-    Remembers its sine and cosine, and with ``"parameters"`` the amplitudes and their rates.
+    All joints share one clock: the elapsed share of the cycle, from 0 to 1. The memory holds its
+    sine and cosine, and with ``"parameters"`` the amplitudes and their rates.
 
-    The commands are :math:`u = k_p (q^* - q) - k_d\,\dot q`, with joints that the observation
-    shows, or :math:`u = q^*` where ``position`` is empty; they are clipped to the limits of the
-    actuators.
+    The commands are :math:`u = k_p (q^* - q) - k_d\,\dot q`, or :math:`u = q^*` if ``position`` is
+    empty, clipped to the limits of the actuators.
 
     :param mode: ``"offset"``: :math:`q^* + \rho\,\alpha`; ``"residual"``: the command
-        :math:`u + \rho\,\alpha`; ``"parameters"``: factors on each amplitude, and one on both
-        frequencies, from ``amplitude_factor`` (linear) and ``frequency_factor`` (geometric): with
-        the defaults, an action of 0 is the gait as it was passed
+        :math:`u + \rho\,\alpha`; ``"parameters"``: a factor for each amplitude, and one for both
+        frequencies, within ``amplitude_factor`` (linear) and ``frequency_factor`` (geometric);
+        with the defaults, an action of 0 leaves the gait unchanged
     :param omega_swing: [rad/s]
     :param omega_stance: [rad/s]
-    :param amplitude: per joint, or one for all [rad]
-    :param offset: likewise
-    :param phase: likewise
+    :param amplitude: :math:`a`, per joint or one for all [rad]
+    :param offset: :math:`b`, per joint or one for all [rad]
+    :param phase: :math:`\varphi`, per joint or one for all [rad]
     :param kp: command per rad
     :param kd: command per rad/s
     :param action_range: :math:`\rho`, in rad for ``"offset"``, in commands for ``"residual"``
     :param amplitude_factor: smallest and largest
     :param frequency_factor: smallest and largest, above 0
     :param amplitude_gain: how fast amplitudes follow their commands [1/s]
-    :param position: where the observation has the position of the joint of each actuator
-    :param velocity: likewise its velocity
+    :param position: index in the observation of the joint position of each actuator
+    :param velocity: index in the observation of the joint velocity of each actuator
     :param dt: control interval [s]
     :raises ParameterError: for numbers out of range
     """
@@ -87,29 +79,25 @@ class Rhythm(StatefulTransform):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.mode not in self.modes:
-            wanted = ", ".join(map(repr, self.modes))
-            raise ParameterError(f"Rhythm(mode={self.mode!r}): mode must be one of {wanted}.")
+        wanted = f"one of {', '.join(map(repr, self.modes))}"
+        self.refuse_unless("mode", self.mode in self.modes, wanted)
         for name in ("omega_swing", "omega_stance", "amplitude_gain", "dt"):
-            if not (math.isfinite(value := getattr(self, name)) and value > 0.0):
-                raise ParameterError(f"Rhythm({name}={value}): {name} must be above 0 and finite.")
-        for name in ("amplitude_factor", "frequency_factor"):
-            refuse_unless(self, name, len(getattr(self, name)) == 2, "smallest and largest")
+            self.refuse_unless(name, 0.0 < getattr(self, name) < math.inf, "above 0 and finite")
+        for name, least in (("amplitude_factor", "0 <="), ("frequency_factor", "0 <")):
+            self.refuse_unless(name, len(getattr(self, name)) == 2, "smallest and largest")
             low, high = getattr(self, name)
-            if not (0.0 <= low < high < math.inf and (low > 0.0 or name[0] == "a")):
-                raise ParameterError(f"Rhythm({name}={[low, high]}): needs 0 <= lowest < highest.")
+            fine = 0.0 <= low < high < math.inf and (low > 0.0 or least == "0 <=")
+            self.refuse_unless(name, fine, f"{least} smallest < largest")
         for name in _PER_JOINT:
-            if not np.isfinite(np.asarray(getattr(self, name), float)).all():
-                raise ParameterError(
-                    f"Rhythm({name}={getattr(self, name)}): {name} must be finite."
-                )
+            values = np.asarray(getattr(self, name), float)
+            self.refuse_unless(name, bool(np.isfinite(values).all()), "finite")
         both = len(self.position) == len(self.velocity)
-        refuse_unless(self, "velocity", both, f"as many as positions ({len(self.position)})")
+        self.refuse_unless("velocity", both, f"as many as positions ({len(self.position)})")
 
     def sized(self, n: int) -> "Rhythm":
         """
-        :return: the same with one number for each of ``n`` joints
-        :raises ParameterError: if it has another number of them
+        :return: the same with all values per joint, for ``n`` joints
+        :raises ParameterError: if a field has another number of values
         """
         per_joint = [getattr(self, name) for name in _PER_JOINT]
         if all(isinstance(values, tuple) and len(values) == n for values in per_joint):
@@ -127,12 +115,12 @@ class Rhythm(StatefulTransform):
 
     @property
     def n_joints(self) -> int:
-        """How many there are, once it is sized."""
+        """Number of joints of a rhythm that is :meth:`sized`."""
         return len(self.amplitude)
 
     @property
     def n_actions(self) -> int:
-        """How many numbers the policy chooses."""
+        """Length of the policy's action."""
         return self.n_joints + (self.mode == "parameters")
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
@@ -155,8 +143,8 @@ class Rhythm(StatefulTransform):
         clock = Channel("sin(clock)", "1", -1.0, 1.0), Channel("cos(clock)", "1", -1.0, 1.0)
         if self.mode != "parameters":
             return clock
-        # From rest within their range, critically damped amplitudes do not leave it, nor do their
-        # rates exceed the gain times its width.
+        # Critically damped amplitudes that start at rest within the range stay in it, and their
+        # rates do not exceed the gain times its width.
         least, most = self.amplitude_factor
         width, names = most - least, [a.name for a in below.actuators]
         radii = [
@@ -165,7 +153,7 @@ class Rhythm(StatefulTransform):
         rates = [Channel(f"rate of it / gain, {name}", "1", -width, width) for name in names]
         return (*clock, *radii, *rates)
 
-    def start(self, obs: InnerObs, below: Signals) -> Recalled:
+    def start(self, obs: InnerObs, below: Signals) -> MemoryVector:
         radii, n = [], len(below.actuators)
         if self.mode == "parameters":
             radii = [0.5 * sum(self.amplitude_factor)] * n + [0.0] * n
@@ -178,27 +166,29 @@ class Rhythm(StatefulTransform):
         return tuple(Actuator(name, "1", -1.0, 1.0) for name in names)
 
     def act(
-        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
-    ) -> tuple[InnerAction, Recalled]:
+        self, action: OuterAction, obs: InnerObs, memory: MemoryVector, below: Signals
+    ) -> tuple[InnerAction, MemoryVector]:
         rhythm, chosen = self.sized(len(below.actuators)), action.clip(-1.0, 1.0)
         target, after = rhythm.target(chosen, memory)
         position, velocity = rhythm.joints_in(obs)
-        return clipped(rhythm.command(chosen, target, position, velocity), below), after
+        return below.clip(rhythm.command(chosen, target, position, velocity)), after
 
     def joints_in(
         self, obs: InnerObs
     ) -> tuple[Float[Any, " act"] | None, Float[Any, " act"] | None]:
-        """:return: positions and velocities that an observation shows; None where none are read"""
+        """:return: positions and velocities in an observation; None if ``position`` is empty"""
         if not self.position:
             return None, None
         return obs[np.array(self.position)], obs[np.array(self.velocity)]
 
-    def target(self, action: OuterAction, memory: Recalled) -> tuple[Float[Any, " act"], Recalled]:
+    def target(
+        self, action: OuterAction, memory: MemoryVector
+    ) -> tuple[Float[Any, " act"], MemoryVector]:
         """
-        Of a rhythm that is :meth:`sized`.
+        For a rhythm that is :meth:`sized`.
 
         :param action: of the policy, from -1 to 1
-        :return: what the joints aim at in the middle of the interval, and the memory after it
+        :return: target positions in the middle of the interval, and the memory after it
         """
         xp, dt = namespace(memory), self.dt
         cycle, n = period(self.omega_swing, self.omega_stance), self.n_joints
@@ -208,19 +198,19 @@ class Rhythm(StatefulTransform):
             wanted = _within(action[:n], self.amplitude_factor)
             slowest, fastest = self.frequency_factor
             rate = slowest * (fastest / slowest) ** (0.5 * (action[n] + 1.0))
-            gain, still = self.amplitude_gain, xp.zeros_like(wanted)
-            state = AmplitudeState(memory[2 : 2 + n], gain * memory[2 + n :], still)
-            radius = advance_amplitude(state, wanted, 0.0, 0.5 * dt, gain).radius
-            settled = advance_amplitude(state, wanted, 0.0, dt, gain)
-            after = xp.concatenate([settled.radius, settled.speed / gain])
-        gone = (clock * cycle + 0.5 * rate * dt) % cycle
-        phase = advance_phase(like(memory, self.phase), gone, self.omega_swing, self.omega_stance)
-        aim = radius * like(memory, self.amplitude) * xp.sin(phase) + like(memory, self.offset)
+            gain = self.amplitude_gain
+            now = memory[2 : 2 + n], gain * memory[2 + n :]
+            radius, _ = advance_amplitude(*now, wanted, 0.5 * dt, gain)
+            radius_after, speed_after = advance_amplitude(*now, wanted, dt, gain)
+            after = xp.concatenate([radius_after, speed_after / gain])
+        time = (clock * cycle + 0.5 * rate * dt) % cycle
+        phase = advance_phase(like(memory, self.phase), time, self.omega_swing, self.omega_stance)
+        target = radius * like(memory, self.amplitude) * xp.sin(phase) + like(memory, self.offset)
         if self.mode == "offset":
-            aim = aim + like(memory, self.action_range) * action
-        turned = 2.0 * math.pi * (clock + rate * dt / cycle)
-        shown = xp.stack([xp.sin(turned), xp.cos(turned)])
-        return aim, xp.concatenate([shown, after]).astype(memory.dtype)
+            target = target + like(memory, self.action_range) * action
+        angle = 2.0 * math.pi * (clock + rate * dt / cycle)
+        clock_after = xp.stack([xp.sin(angle), xp.cos(angle)])
+        return target, xp.concatenate([clock_after, after]).astype(memory.dtype)
 
     def command(
         self,
@@ -231,7 +221,7 @@ class Rhythm(StatefulTransform):
     ) -> Float[Any, " act"]:
         """
         :param position: of the joints; None: the targets are the commands
-        :param velocity: likewise
+        :param velocity: of the joints; None with ``position``
         :return: the commands of the actuators, not clipped
         """
         command = target
@@ -244,5 +234,5 @@ class Rhythm(StatefulTransform):
 
 
 def _within(share: Any, ends: Sequence[float]) -> Any:
-    """From -1 to 1 onto an interval."""
+    """Map [-1, 1] linearly onto an interval."""
     return ends[0] + 0.5 * (share + 1.0) * (ends[1] - ends[0])

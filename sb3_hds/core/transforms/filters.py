@@ -1,4 +1,4 @@
-"""Transforms of commands: rate limit, low-pass filter, delay, scale."""
+"""Transforms of commands: rate limit, low-pass filter, delay, scale, penalty on changes."""
 
 import dataclasses
 import math
@@ -9,37 +9,46 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core.signals import Channel
+from sb3_hds.core.declarations import Channel
 from sb3_hds.core.transforms.base import (
     InnerAction,
     InnerObs,
+    MemoryVector,
     OuterAction,
-    Recalled,
     Signals,
     StatefulTransform,
     like,
     namespace,
-    per_place,
-    refuse_unless,
 )
+from sb3_hds.errors import ParameterError
 
-#: of a low-pass [cycles per step]: 0.1 Hz at 10 kHz
+#: lowest cut-off of a low-pass [cycles per step]: 0.1 Hz at 10 kHz
 LOWEST_CUTOFF = 1e-5
-# A bound of an observation must hold in single precision, too.
+# Margin of observation bounds for rounding in single precision.
 _ROUNDING = 1e-5
-# The impulse response of a filter is summed until this share of what was remembered is left.
+# The impulse response of a filter is summed until this share of the initial memory is left.
 _NEGLIGIBLE = 1e-12
 
 
+class LastCommand(StatefulTransform):
+    """Abstract: remembers the last command; before an episode, the one nearest to zero."""
+
+    def remembers(self, below: Signals) -> tuple[Channel, ...]:
+        return tuple(Channel(f"last {a.name}", *a[1:]) for a in below.actuators)
+
+    def start(self, obs: InnerObs, below: Signals) -> MemoryVector:
+        return like(obs, below.rest())
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RateLimit(StatefulTransform):
+class RateLimit(LastCommand):
     r"""
     Commands change by at most :math:`\Delta` from one step to the next:
 
     .. math:: u_k = \min(\max(a_k, u_{k-1} - \Delta), u_{k-1} + \Delta)
 
-    Remembers :math:`u_{k-1}`; before an episode, the command nearest to zero. Where the limit is
-    active, the derivative with respect to the action is zero.
+    The memory is :math:`u_{k-1}`; before an episode, the command nearest to zero. Where the limit
+    is active, the derivative with respect to the action is zero.
 
     :param max_change: :math:`\Delta` [command unit], one number or one per actuator
     :raises ParameterError: unless it is positive
@@ -51,43 +60,49 @@ class RateLimit(StatefulTransform):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        refuse_unless(self, "max_change", bool(np.all(np.array(self.max_change) > 0.0)), "positive")
+        self.refuse_unless("max_change", bool(np.all(np.array(self.max_change) > 0.0)), "positive")
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
-        per_place(self, "max_change", len(below.actuators), "actuators")
-        return tuple(Channel(f"last {a.name}", *a[1:]) for a in below.actuators)
-
-    def start(self, obs: InnerObs, below: Signals) -> Recalled:
-        return namespace(obs).asarray(below.rest(), dtype=obs.dtype)
+        self._per_actuator(below)
+        return super().remembers(below)
 
     def act(
-        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
-    ) -> tuple[InnerAction, Recalled]:
-        most = like(action, per_place(self, "max_change", len(below.actuators), "actuators"))
-        wanted = clipped(action, below)
+        self, action: OuterAction, obs: InnerObs, memory: MemoryVector, below: Signals
+    ) -> tuple[InnerAction, MemoryVector]:
+        most = like(action, self._per_actuator(below))
+        wanted = below.clip(action)
         command = wanted.clip(memory - most, memory + most)
         return command, command
+
+    def _per_actuator(self, below: Signals) -> np.ndarray:
+        values, n = np.atleast_1d(np.asarray(self.max_change, float)), len(below.actuators)
+        if values.shape not in ((1,), (n,)):
+            raise ParameterError(
+                f"RateLimit has {values.size} values of max_change, but there are {n} actuators. "
+                "Pass one number, or one for each."
+            )
+        return np.broadcast_to(values, (n,))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LowPass(StatefulTransform):
     r"""
-    A Butterworth low-pass of each command, by the bilinear transform: sections of second order one
-    after the other, each two trapezoidal integrators of :math:`g = \tan(\pi f)`, and one of first
-    order where the order is odd:
+    A Butterworth low-pass of each command, by the bilinear transform: cascaded second-order
+    sections of two trapezoidal integrators each, with :math:`g = \tan(\pi f)`, and a first-order
+    section if the order is odd:
 
     .. math:: v = \frac{z_1 + g\,(a - z_2)}{1 + g\,(g + k)}, \quad y = z_2 + g v, \quad
         z_1 \leftarrow 2 v - z_1, \quad z_2 \leftarrow 2 y - z_2
 
-    In this form a constant passes unchanged however low the cut-off and the precision; polynomials
-    of the same filter lose it in single precision. The command is :math:`y` of the last section,
-    clipped to the limits of the actuator: from second order on, a low-pass overshoots. Remembers
-    the :math:`z`; before an episode, those at rest at the command nearest to zero.
+    In this form a constant passes unchanged at any cut-off and precision; polynomials of the same
+    filter lose it in single precision. The command is :math:`y` of the last section, clipped to
+    the limits of the actuator: from second order on, a low-pass overshoots. The memory holds the
+    :math:`z`; before an episode, those at rest at the command nearest to zero.
 
     Source: Zavalishin, *The Art of VA Filter Design*, 2018, chapters 3 to 5.
 
-    :param cutoff: :math:`f`, where half of the power passes [cycles per step], below a half
-    :param order: a whole number from 1
+    :param cutoff: :math:`f`, the -3 dB frequency [cycles per step], below 0.5
+    :param order: at least 1
     :raises ParameterError: for a cut-off or an order out of range
     """
 
@@ -99,9 +114,9 @@ class LowPass(StatefulTransform):
     def __post_init__(self) -> None:
         super().__post_init__()
         fine = LOWEST_CUTOFF <= self.cutoff < 0.5
-        refuse_unless(self, "cutoff", fine, f"from {LOWEST_CUTOFF:g} to below 0.5")
+        self.refuse_unless("cutoff", fine, f"from {LOWEST_CUTOFF:g} to below 0.5")
         whole = isinstance(self.order, int) and self.order >= 1
-        refuse_unless(self, "order", whole, "a whole number of at least 1")
+        self.refuse_unless("order", whole, "a whole number of at least 1")
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         low, high = below.limits()
@@ -113,21 +128,21 @@ class LowPass(StatefulTransform):
             for a, m, w in zip(below.actuators, 0.5 * (low + high), swing[i] * half, strict=True)
         )
 
-    def start(self, obs: InnerObs, below: Signals) -> Recalled:
+    def start(self, obs: InnerObs, below: Signals) -> MemoryVector:
         return like(obs, np.outer(self._at_rest(), below.rest()).ravel())
 
     def act(
-        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
-    ) -> tuple[InnerAction, Recalled]:
-        n, wanted = len(below.actuators), clipped(action, below)
+        self, action: OuterAction, obs: InnerObs, memory: MemoryVector, below: Signals
+    ) -> tuple[InnerAction, MemoryVector]:
+        n, wanted = len(below.actuators), below.clip(action)
         y, after = self._passed(wanted, [memory[i * n : (i + 1) * n] for i in range(self.order)])
-        return clipped(y, below), namespace(action).concatenate(after)
+        return below.clip(y), namespace(action).concatenate(after)
 
     def _passed(self, y: Any, z: Sequence[Any]) -> tuple[Any, list[Any]]:
         """
-        :param y: what comes in
-        :param z: what each integrator remembers
-        :return: what comes out, and what they remember then
+        :param y: the input
+        :param z: the state of each integrator
+        :return: the output, and the states after it
         """
         g, after = math.tan(math.pi * self.cutoff), []
         for i in range(self.order // 2):
@@ -143,11 +158,11 @@ class LowPass(StatefulTransform):
         return y, after
 
     def _at_rest(self) -> np.ndarray:
-        """What it remembers of a command of one that never changed, shape ``(order,)``."""
+        """The states after a constant command of one, shape ``(order,)``."""
         return np.array([0.0, 1.0] * (self.order // 2) + [1.0] * (self.order % 2))
 
     def _largest(self) -> np.ndarray:
-        """The most that it remembers of commands within [-1, 1], shape ``(order,)``."""
+        """The largest states under commands within [-1, 1], shape ``(order,)``."""
         step = np.array(self._passed(0.0, list(np.eye(self.order)))[1])
         answers = np.array(self._passed(1.0, [0.0] * self.order)[1])[:, None]
         while np.abs(step).max() > _NEGLIGIBLE:
@@ -161,8 +176,8 @@ class Delay(StatefulTransform):
     Delays commands by a whole number of steps; until the first arrives, the command nearest to zero
     acts.
 
-    The memory holds the commands in transit, the oldest first. For a delay that is no multiple of
-    the step, or that is to be estimated, use :class:`sb3_hds.effects.ActionDelay`.
+    The memory holds the commands in transit, the oldest first. For a delay that is not a multiple
+    of the step, or that is to be estimated, use :class:`sb3_hds.effects.ActionDelay`.
 
     :param steps: length of the delay [control intervals]
     :raises ParameterError: unless it is a positive whole number
@@ -175,20 +190,20 @@ class Delay(StatefulTransform):
     def __post_init__(self) -> None:
         super().__post_init__()
         whole = isinstance(self.steps, int) and self.steps >= 1
-        refuse_unless(self, "steps", whole, "a whole number of at least 1")
+        self.refuse_unless("steps", whole, "a whole number of at least 1")
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         return tuple(
             Channel(f"{a.name} in {i}", *a[1:]) for i in range(self.steps) for a in below.actuators
         )
 
-    def start(self, obs: InnerObs, below: Signals) -> Recalled:
+    def start(self, obs: InnerObs, below: Signals) -> MemoryVector:
         return like(obs, np.tile(below.rest(), self.steps))
 
     def act(
-        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
-    ) -> tuple[InnerAction, Recalled]:
-        n, queue = len(below.actuators), [memory, clipped(action, below)]
+        self, action: OuterAction, obs: InnerObs, memory: MemoryVector, below: Signals
+    ) -> tuple[InnerAction, MemoryVector]:
+        n, queue = len(below.actuators), [memory, below.clip(action)]
         return memory[:n], namespace(action).concatenate(queue)[n:]
 
 
@@ -200,13 +215,13 @@ class Scale(StatefulTransform):
     .. math:: u = m + s\,(a - m)
 
     Actuators that are not among ``axes`` keep their full range. The share follows a schedule,
-    piecewise linear and constant beyond its ends. The memory is the progress along a schedule that
-    changes, from 0 to 1, over all episodes; an episode of a twin starts at a random progress.
-    Without ``observed``, a twin infers the beginning of the schedule.
+    piecewise linear and constant beyond its ends. If it changes, the memory is the progress along
+    it, from 0 to 1, over all episodes; an episode of a twin starts at a random progress. Without
+    ``observed``, a twin infers the beginning of the schedule.
 
     :param schedule: ``((steps, share), ...)``, steps growing from 0, shares above 0 and at most 1
     :param axes: indices of the scaled actuators; None: all
-    :raises ParameterError: for any other schedule, or actuators that there are not
+    :raises ParameterError: for an invalid schedule, or actuators that do not exist
     """
 
     name: ClassVar[str] = "scale"
@@ -222,20 +237,20 @@ class Scale(StatefulTransform):
         fine = fine and bool(np.all(np.diff(points[:, 0]) > 0.0))
         fine = fine and bool(np.all((points[:, 1] > 0.0) & (points[:, 1] <= 1.0)))
         wanted = "pairs of steps, growing from 0, and a share above 0 and at most 1"
-        refuse_unless(self, "schedule", bool(fine), wanted)
+        self.refuse_unless("schedule", bool(fine), wanted)
 
     @property
     def length(self) -> float:
-        """Steps until the last point; 0 where nothing changes."""
+        """Steps until the last point; 0 if the share is constant."""
         return float(self.schedule[-1][0])
 
     def remembers(self, below: Signals) -> tuple[Channel, ...]:
         n = len(below.actuators)
         fine = self.axes is None or (len(self.axes) > 0 and set(self.axes) <= set(range(n)))
-        refuse_unless(self, "axes", fine, f"numbers of the {n} actuators, from 0 to {n - 1}")
+        self.refuse_unless("axes", fine, f"numbers of the {n} actuators, from 0 to {n - 1}")
         return (Channel("progress of the scale", "1", 0.0, 1.0),) if self.length else ()
 
-    def start(self, obs: InnerObs, below: Signals) -> Recalled:
+    def start(self, obs: InnerObs, below: Signals) -> MemoryVector:
         return like(obs, np.zeros(1 if self.length else 0))
 
     def draw(
@@ -244,15 +259,15 @@ class Scale(StatefulTransform):
         return jax.random.uniform(key, (1 if self.length else 0,), obs.dtype)
 
     def act(
-        self, action: OuterAction, obs: InnerObs, memory: Recalled, below: Signals
-    ) -> tuple[InnerAction, Recalled]:
+        self, action: OuterAction, obs: InnerObs, memory: MemoryVector, below: Signals
+    ) -> tuple[InnerAction, MemoryVector]:
         middle = like(action, 0.5 * np.sum(below.limits(), 0))
         share = self.share(memory, len(below.actuators))
-        command = middle + share * (clipped(action, below) - middle)
+        command = middle + share * (below.clip(action) - middle)
         return command, (memory + 1.0 / self.length).clip(0.0, 1.0) if self.length else memory
 
-    def share(self, memory: Recalled, n: int) -> Any:
-        """:return: of the range that each of ``n`` commands reaches now, or one for all"""
+    def share(self, memory: MemoryVector, n: int) -> Any:
+        """:return: the current share of each of ``n`` commands, or one for all"""
         share = self.schedule[0][1]
         if self.length:
             steps, shares = np.array(self.schedule).T
@@ -263,7 +278,32 @@ class Scale(StatefulTransform):
         return 1.0 + like(memory, np.isin(np.arange(n), self.axes)) * (share - 1.0)
 
 
-def clipped(command: Float[Any, " act"], below: Signals) -> Float[Any, " act"]:
-    """:return: the command within the limits of the actuators below"""
-    low, high = below.limits()
-    return command.clip(like(command, low), like(command, high))
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Continuity(LastCommand):
+    r"""
+    Subtracts :math:`w\,|a_k - a_{k-1}|^2` from the reward, and does not change actions.
+
+    The memory is :math:`a_{k-1}`; before an episode, the command nearest to zero.
+
+    Source: Raffin, Kober and Stulp, *Smooth exploration for robotic reinforcement learning*, CoRL
+    2021, section 4.1, where it is a measure.
+
+    :param weight: :math:`w`
+    :raises ParameterError: unless it is finite and at least 0
+    """
+
+    name: ClassVar[str] = "continuity"
+
+    weight: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.refuse_unless("weight", 0.0 <= self.weight < math.inf, "finite and at least 0")
+
+    def act(
+        self, action: OuterAction, obs: InnerObs, memory: MemoryVector, below: Signals
+    ) -> tuple[InnerAction, MemoryVector]:
+        return action, below.clip(action)
+
+    def cost(self, action: OuterAction, obs: InnerObs, memory: MemoryVector, below: Signals) -> Any:
+        return self.weight * ((below.clip(action) - memory) ** 2).sum()

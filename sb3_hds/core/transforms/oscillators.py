@@ -1,12 +1,12 @@
 r"""
-Oscillators that make gaits, in closed form.
+Oscillators for gaits, in closed form.
 
-A phase moves fast in one half of its cycle and slowly in the other:
+A phase has different frequencies in the two halves of its cycle:
 
 .. math:: \dot\theta = \omega_{swing} \text{ if } \sin\theta > 0 \text{ else } \omega_{stance}
 
-Derivatives exist with respect to everything. Those of a phase jump where it changes over between
-swing and stance, and are right on both sides.
+All functions are differentiable with respect to all arguments. Derivatives of a phase jump at the
+transitions between swing and stance, and are correct on both sides.
 """
 
 import math
@@ -23,16 +23,16 @@ PerJoint = Float[Array, " act"]
 class Gait(NamedTuple):
     r"""
     One oscillator per joint, :math:`q_i(t) = a_i \sin(\theta_i(t) + \varphi_i) + b_i` with
-    :math:`\theta_i(0) = 0`, whose phase :math:`\theta_i + \varphi_i` swings and stands.
+    :math:`\theta_i(0) = 0`; swing and stance depend on :math:`\theta_i + \varphi_i`.
 
     Source: Raffin et al., *An Open-Loop Baseline for Reinforcement Learning Locomotion Tasks*,
     RLJ 2024, equation 1.
 
-    :param amplitude: :math:`a`, in the unit of the joint: rad, m
-    :param offset: :math:`b`, likewise
+    :param amplitude: :math:`a` [rad] or [m]
+    :param offset: :math:`b` [rad] or [m]
     :param phase: :math:`\varphi` [rad]
-    :param omega_swing: while the sine is positive [rad/s], above 0
-    :param omega_stance: while it is not [rad/s], above 0
+    :param omega_swing: frequency while the sine is positive [rad/s], above 0
+    :param omega_stance: frequency while it is not [rad/s], above 0
     """
 
     amplitude: PerJoint
@@ -43,7 +43,7 @@ class Gait(NamedTuple):
 
 
 def period(omega_swing: Any, omega_stance: Any) -> Any:
-    """:return: of one cycle [s]"""
+    """:return: duration of one cycle [s]"""
     return math.pi / omega_swing + math.pi / omega_stance
 
 
@@ -54,35 +54,29 @@ def advance_phase(
     omega_stance: Float[Any, "*#shape"] | float,
 ) -> Float[Any, "*shape"]:
     """
-    Takes arrays of NumPy and JAX alike.
-
-    Where a phase is after some time, exactly: the cycle is two straight lines in time, so nothing
-    is integrated. An Euler step of length h is late by up to ``h`` at each change-over, and the
-    delays add up: ``h (omega_swing - omega_stance)`` rad per change-over at most.
+    The exact phase after some time: it is piecewise linear, so nothing is integrated. Euler steps
+    of length h are late by up to ``h`` at each transition, and these errors accumulate: at most
+    ``h (omega_swing - omega_stance)`` rad per transition. Takes arrays of NumPy and JAX alike.
 
     :param phase: any angle [rad]
     :param duration: 0 or more [s]
     :param omega_swing: [rad/s]
     :param omega_stance: [rad/s]
-    :return: within one turn, from 0 to 2 pi [rad]
+    :return: the phase, from 0 to 2 pi [rad]
     """
     xp = phase.__array_namespace__()
     angle = xp.remainder(phase, 2.0 * math.pi)
     swing = math.pi / omega_swing
-    gone = xp.where(angle < math.pi, angle / omega_swing, swing + (angle - math.pi) / omega_stance)
-    gone = xp.remainder(gone + duration, period(omega_swing, omega_stance))
-    in_swing, in_stance = gone * omega_swing, math.pi + (gone - swing) * omega_stance
-    return xp.where(gone < swing, in_swing, in_stance)
-
-
-def phase_at(gait: Gait, time: Scalar | float) -> PerJoint:
-    """:return: the phase of each joint ``time`` seconds after the start [rad], exactly"""
-    return advance_phase(gait.phase, time, gait.omega_swing, gait.omega_stance)
+    time = xp.where(angle < math.pi, angle / omega_swing, swing + (angle - math.pi) / omega_stance)
+    time = xp.remainder(time + duration, period(omega_swing, omega_stance))
+    in_swing, in_stance = time * omega_swing, math.pi + (time - swing) * omega_stance
+    return xp.where(time < swing, in_swing, in_stance)
 
 
 def target_at(gait: Gait, time: Scalar | float) -> PerJoint:
-    """:return: the wanted position of each joint ``time`` seconds after the start"""
-    return gait.amplitude * jnp.sin(phase_at(gait, time)) + gait.offset
+    """:return: the target position of each joint ``time`` seconds after the start"""
+    phase = advance_phase(gait.phase, time, gait.omega_swing, gait.omega_stance)
+    return gait.amplitude * jnp.sin(phase) + gait.offset
 
 
 _HALF, _QUARTER = math.pi, 0.5 * math.pi
@@ -96,49 +90,34 @@ LEADS: dict[str, tuple[float, float, float, float]] = {
 }
 
 
-class AmplitudeState(NamedTuple):
-    """
-    Arrays of NumPy or JAX.
+def advance_amplitude(
+    radius: Float[Any, " n"],
+    speed: Float[Any, " n"],
+    mu: Float[Any, " n"],
+    dt: Scalar | float,
+    gain: Scalar | float,
+) -> tuple[Float[Any, " n"], Float[Any, " n"]]:
+    r"""
+    Amplitudes that follow their commands:
+
+    .. math:: \ddot r = a \left(\tfrac{a}{4} (\mu - r) - \dot r\right)
+
+    The equation is linear and critically damped, so it is solved exactly while the command is
+    held, with :math:`e = r - \mu` and :math:`k = a/2`:
+    :math:`e(t) = (e_0 + (\dot r_0 + k e_0)\,t)\,e^{-kt}`. Takes arrays of NumPy and JAX alike.
+
+    Source: Bellegarda and Ijspeert, *CPG-RL: Learning central pattern generators for quadruped
+    locomotion*, RA-L 2022, equation 1.
 
     :param radius: amplitude of each oscillator
     :param speed: its time derivative [1/s]
-    :param phase: of each [rad], within one turn
-    """
-
-    radius: Float[Any, " n"]
-    speed: Float[Any, " n"]
-    phase: Float[Any, " n"]
-
-
-def advance_amplitude(
-    state: AmplitudeState,
-    mu: Float[Any, " n"],
-    omega: Float[Any, " #n"] | Scalar | float,
-    dt: Scalar | float,
-    gain: Scalar | float = 150.0,
-) -> AmplitudeState:
-    r"""
-    Oscillators whose amplitude and frequency are commanded, not coupled to each other:
-
-    .. math:: \ddot r = a \left(\tfrac{a}{4} (\mu - r) - \dot r\right), \qquad \dot\theta = \omega
-
-    The first is critically damped and linear, so while the commands are held both are solved
-    exactly, with :math:`e = r - \mu` and :math:`k = a/2`:
-    :math:`e(t) = (e_0 + (\dot r_0 + k e_0)\,t)\,e^{-kt}`.
-
-    Source: Bellegarda and Ijspeert, *CPG-RL: Learning central pattern generators for quadruped
-    locomotion*, RA-L 2022, equations 1 and 2.
-
-    :param mu: amplitudes to settle at
-    :param omega: [rad/s]
+    :param mu: commanded amplitudes
     :param dt: how long the commands are held [s]
     :param gain: :math:`a` [1/s]
-    :return: the state ``dt`` later
+    :return: amplitudes and their time derivatives ``dt`` later
     """
-    k, xp = 0.5 * gain, state.radius.__array_namespace__()
-    error = state.radius - mu
-    slope = state.speed + k * error
-    decay = xp.exp(-k * dt)
-    radius = mu + (error + slope * dt) * decay
-    speed = (slope - k * (error + slope * dt)) * decay
-    return AmplitudeState(radius, speed, (state.phase + omega * dt) % (2.0 * math.pi))
+    k, error = 0.5 * gain, radius - mu
+    decay = radius.__array_namespace__().exp(-k * dt)
+    slope = speed + k * error
+    error = error + slope * dt
+    return mu + error * decay, (slope - k * error) * decay

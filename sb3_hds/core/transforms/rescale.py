@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sb3_hds.core.signals import Actuator, Channel
+from sb3_hds.core.declarations import Actuator, Channel
 from sb3_hds.core.transforms.base import ActionTransform, ObservationTransform
 from sb3_hds.errors import ParameterError
 
@@ -20,7 +20,7 @@ _Signal = TypeVar("_Signal", Actuator, Channel)
 class _Bounds:
     """
     :param low: lower bound, one number or one for each signal
-    :param high: upper bound, likewise
+    :param high: upper bound, one number or one for each signal
     :raises ParameterError: unless both are finite and ``low < high``
     """
 
@@ -64,9 +64,9 @@ class _Bounds:
 @dataclasses.dataclass(frozen=True)
 class RescaleAction(_Bounds, ActionTransform):
     """
-    Gymnasium's ``RescaleAction``: ``[low, high]`` maps linearly onto the limits of each actuator.
+    Gymnasium's ``RescaleAction``: maps ``[low, high]`` linearly onto the limits of each actuator.
 
-    As there, a command beyond the limits is not clipped: that is left to the twin below.
+    As there, commands beyond the limits are not clipped here, but by the wrapped twin.
 
     :param low: smallest command, one number or one per actuator
     :param high: largest command, one number or one per actuator
@@ -87,7 +87,8 @@ class RescaleAction(_Bounds, ActionTransform):
 @dataclasses.dataclass(frozen=True)
 class RescaleObservation(_Bounds, ObservationTransform):
     """
-    Gymnasium's ``RescaleObservation``: limits of each channel map linearly onto ``[low, high]``.
+    Gymnasium's ``RescaleObservation``: maps the limits of each channel linearly onto
+    ``[low, high]``.
 
     :param low: smallest observation, one number or one per channel
     :param high: largest observation, one number or one per channel

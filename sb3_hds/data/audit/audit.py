@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_hds.core.signals import Channel
+from sb3_hds.core.declarations import Channel
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.trajectories.episodes import same_interval
 from sb3_hds.core.twin import Twin

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from sb3_hds.core.signals import Channel
+from sb3_hds.core.declarations import Channel
 from sb3_hds.core.trajectories import Trajectories
 from sb3_hds.core.twin import Twin
 from sb3_hds.data.audit.finding import Finding

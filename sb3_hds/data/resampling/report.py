@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple, get_args
 
-from sb3_hds.core.signals import Actuator, Channel
+from sb3_hds.core.declarations import Actuator, Channel
 from sb3_hds.core.trajectories.episodes import SAME_RATE
 from sb3_hds.data.conversion import same_quantity
 from sb3_hds.data.resampling.clock import Kind

@@ -4,11 +4,9 @@ Studies: algorithms, environments and seeds, run, resumed and reported.
 Names are imported on first use.
 """
 
-from typing import TYPE_CHECKING
+from sb3_hds.lazy import lazy_imports
 
-from sb3_hds.lazy import lazily
-
-if TYPE_CHECKING:
+with lazy_imports(__name__):
     from sb3_hds.experiments.study.definition import Run, Study, zoo_command
     from sb3_hds.experiments.study.report import Reported, results_of, write_report
     from sb3_hds.experiments.study.runner import (
@@ -34,12 +32,3 @@ __all__ = [
     "write_report",
     "zoo_command",
 ]
-
-lazily(
-    __name__,
-    {
-        "definition": ("Run", "Study", "zoo_command"),
-        "report": ("Reported", "results_of", "write_report"),
-        "runner": ("Done", "Progress", "is_complete", "progress_of", "run_study", "seconds_to_go"),
-    },
-)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from sb3_hds.core import Effect, Trajectories, Twin
 from sb3_hds.core.belief import BeliefTwin
 from sb3_hds.core.contract import check_methods
-from sb3_hds.core.numerics.kept_programs import keep_programs
+from sb3_hds.core.numerics.compilation import keep_programs
 from sb3_hds.effects import ALL, effect_named
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.diagnosis.pipeline import EFFORTS, Inquiry

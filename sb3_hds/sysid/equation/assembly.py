@@ -238,7 +238,7 @@ def _passing(h: Hypotheses, equation: Equation, items: Sequence[Item]) -> dict[i
             continue
         effect = h.effect_of(item.candidate)
         assert isinstance(effect, ActionEffect)
-        low, high = (at[effect.chained] for at in item.settings)
+        low, high = (at[effect.interpolated] for at in item.settings)
         size = np.abs(commands[:, item.candidate.index])
         middle = 0.5 * (low + high)
         passing = size < middle if item.candidate.name == "saturation" else size > 0.5 * middle

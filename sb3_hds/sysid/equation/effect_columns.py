@@ -192,17 +192,17 @@ def add_command(made: Equation, candidate: Candidate, effect: ActionEffect) -> N
         return
     settings = effect.grid(ranges_of(made, None, i))
     nulls = {name: p.null for name, p in effect.parameters.items()}
-    if effect.chained and len(settings) < 2:
+    if effect.interpolated and len(settings) < 2:
         return
     steps = {name: STEP * p.scale for name, p in effect.parameters.items()}
     given = [{**nulls, **at} for at in settings]
-    if not effect.chained:
+    if not effect.interpolated:
         given = [{**nulls, name: nulls[name] + step} for name, step in steps.items()]
     commands = _commanded(made, effect, given, i)
     before = forces(twin, twin.params, rows.q, rows.v, rows.actions[None])[0]
     after = forces(twin, twin.params, rows.q, rows.v, commands)
     changes = after - before
-    if not effect.chained:
+    if not effect.interpolated:
         columns = {
             name: put_acting(made, change / step)
             for (name, step), change in zip(steps.items(), changes, strict=True)
@@ -214,7 +214,7 @@ def add_command(made: Equation, candidate: Candidate, effect: ActionEffect) -> N
     for k in range(len(settings) - 1):
         whole = put_acting(made, changes[k])
         part = put_acting(made, changes[k + 1] - changes[k])
-        own = (effect.chained, effect.chained)
+        own = (effect.interpolated, effect.interpolated)
         made.items.append(Item(candidate, (whole, part), own, "chain", settings[k : k + 2]))
 
 

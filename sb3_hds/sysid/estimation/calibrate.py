@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.contract import check_methods
-from sb3_hds.core.numerics.kept_programs import keep_programs
+from sb3_hds.core.numerics.compilation import keep_programs
 from sb3_hds.core.trajectories.episodes import same_interval
 from sb3_hds.data.resampling.report import Reading
 from sb3_hds.errors import CalibrationError

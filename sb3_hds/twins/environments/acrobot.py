@@ -7,18 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State, rk4
-from sb3_hds.core.types import (
-    Action,
-    Flag,
-    Force,
-    MassMatrix,
-    Obs,
-    Params,
-    Position,
-    Scalar,
-    Velocity,
-)
+from sb3_hds.core import Actuator, AnalyticTwin, Channel, Flag, Joint, Parameter, State, rk4
+from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position, Scalar, Velocity
 
 _MAX_SPEED_1 = 4.0 * math.pi  # [rad/s]
 _MAX_SPEED_2 = 9.0 * math.pi  # [rad/s]
@@ -34,25 +24,24 @@ class Acrobot(AnalyticTwin):
         d_2 \ddot\theta_1 + (m_2 c_2^2 + I_2)\,\ddot\theta_2
         + m_2 l_1 c_2 \dot\theta_1^2 \sin\theta_2 + \phi_2 &= u
 
-    with :math:`d_1, d_2, \phi_1, \phi_2` of Sutton and Barto. Reproduces the dynamics of
-    ``gymnasium/envs/classic_control/acrobot.py`` (``book_or_nips = "book"``) for any torque in
-    [-1, 1] N m: one RK4 step, speeds clipped afterwards. Where a clip is active, the derivative is
-    zero. Angles are not wrapped, so that trajectories stay smooth; observations do not show the
-    difference.
-    :math:`\theta = 0` hangs down.
+    with :math:`d_1, d_2, \phi_1, \phi_2` of Sutton and Barto; :math:`\theta = 0` hangs down.
+    Reproduces the dynamics of ``gymnasium/envs/classic_control/acrobot.py``
+    (``book_or_nips = "book"``) for any torque in [-1, 1] N m: one RK4 step, speeds clipped
+    afterwards. Where a clip is active, the derivative is zero. Angles are not wrapped, so that
+    trajectories stay smooth; observations are the same.
 
-    As in Gymnasium, the tip is high when :math:`y = -\cos\theta_1 - \cos(\theta_1 + \theta_2)`
-    exceeds one, whatever the lengths of the links, and each step before costs one. That has no
-    gradient, so planning adds the gain of a potential. With :math:`e` the mechanical energy as a
-    fraction of what it takes from hanging to the lowest configuration with a high tip, and
-    :math:`\operatorname{sp}` the softplus,
+    As in Gymnasium, the goal is :math:`y = -\cos\theta_1 - \cos(\theta_1 + \theta_2) > 1`, for any
+    lengths of the links, and each step before it costs one. This reward has no gradient, so
+    planning adds the gain of a potential. With the mechanical energy :math:`e` as a fraction of
+    that of the lowest goal configuration at rest, relative to hanging, and the softplus
+    :math:`\operatorname{sp}`,
 
     .. math::
         \Phi = -30 \cdot 0.1 \operatorname{sp}\!\Big(\frac{1.2 - e}{0.1}\Big)
                + 5\,\sigma\!\Big(\frac{y - 1}{0.25}\Big), \qquad
         r_\text{plan} = r + \Phi(s') - \Phi(s)
 
-    It adds up to nearly the same number on every way to the goal: what is left to gain is time.
+    The gains add up to nearly the same number on every path to the goal, so plans differ in time.
     """
 
     name = "Acrobot"
@@ -151,7 +140,7 @@ class Acrobot(AnalyticTwin):
 
 
 def _weights(params: Params) -> tuple[Any, Any]:
-    """Torque of gravity at the two joints when both links lie flat [N m]."""
+    """Torque of gravity at the two joints with both links horizontal [N m]."""
     m_2 = params["link2_mass"]
     first = params["link1_mass"] * params["link1_com"] + m_2 * params["link1_length"]
     return first * params["gravity"], m_2 * params["link2_com"] * params["gravity"]

@@ -1,4 +1,4 @@
-"""What the twins of Gymnasium's inverted pendulums read from a compiled MuJoCo model."""
+"""Parameters of Gymnasium's inverted pendulums, read from a compiled MuJoCo model."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ def read(env: Any, poles: int) -> dict[str, Any]:
     :param env: an environment, wrapped or not, whose ``unwrapped`` has a compiled MuJoCo ``model``
     :param poles: how many poles there are
     :return: values of parameters, and the settings ``dt``, ``substeps`` and ``reset_noise_scale``
-    :raises EnvironmentMismatchError: if the model has more in it than the equations of motion
+    :raises EnvironmentMismatchError: for features that the equations of motion do not have
     """
     env = env.unwrapped
     model, gravity = env.model, env.model.opt.gravity
@@ -48,12 +48,12 @@ def read(env: Any, poles: int) -> dict[str, Any]:
 
 
 def require(condition: Any, expected: str) -> None:
-    """:raises EnvironmentMismatchError: if the model does not keep what the twin relies on"""
+    """:raises EnvironmentMismatchError: if the model violates an assumption of the twin"""
     if not condition:
         raise EnvironmentMismatchError(
-            f"The twin expects {expected}, but the environment's XML has it otherwise. "
-            "Masses, shapes, damping, armature, gravity, gear and time step are free to change; "
-            "for anything else, pass a twin of your own."
+            f"The twin expects {expected}, and the environment's XML differs. Masses, shapes, "
+            "damping, armature, gravity, gear and time step may change; for anything else, pass "
+            "your own twin."
         )
 
 

@@ -1,4 +1,4 @@
-"""Twin of ``sb3_hds/CartPoleSwingUp-v0``: ``CartPole-v1`` with another task."""
+"""Twin of ``sb3_hds/CartPoleSwingUp-v0``: ``CartPole-v1`` as a swing-up task."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ _MAX_FORCE = 10.0  # [N]
 
 class CartPole(Rig):
     r"""
-    A pole swung up by pushing the cart that it stands on.
+    A pole on a cart, swung up by pushing the cart.
 
     .. math::
         (m_c + m_p)\,\ddot x + m_p l\,(\dot\omega \cos\theta - \omega^2 \sin\theta) &= u \\
@@ -23,15 +23,15 @@ class CartPole(Rig):
 
     with :math:`l` half the length of the pole; :math:`\theta = 0` is upright. Reproduces
     ``gymnasium/envs/classic_control/cartpole.py`` with ``kinematics_integrator = "semi-implicit"``
-    and any force in [-10, 10] N. There is no end of the track and no termination. The reward is
+    and any force in [-10, 10] N, without ends of the track and without termination. The reward is
     smooth:
 
     .. math::
         r = -2\,(1 - \cos\theta) - 0.2\,x^2
             - 0.01\,\big(\dot x^2 + \omega^2 + (u / 10\,\mathrm{N})^2\big)
 
-    :param observe: ``"task"`` for the environment's observations and its integrator; ``"q"`` or
-        ``"qv"`` for a rig in continuous time, which takes any force
+    :param observe: ``"task"`` for the environment's observations and integrator; ``"q"`` or
+        ``"qv"`` for a rig in continuous time without limits of the force
     """
 
     name = "CartPole"

@@ -6,18 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State, rk4
-from sb3_hds.core.types import (
-    Action,
-    Flag,
-    Force,
-    MassMatrix,
-    Obs,
-    Params,
-    Position,
-    Scalar,
-    Velocity,
-)
+from sb3_hds.core import Actuator, AnalyticTwin, Channel, Flag, Joint, Parameter, State, rk4
+from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position, Scalar, Velocity
 from sb3_hds.twins.environments import cart_and_poles
 
 _MAX_REPORTED = 10.0  # [m/s], [rad/s]
@@ -46,23 +36,22 @@ class InvertedDoublePendulum(AnalyticTwin):
 
     Reproduces MuJoCo's RK4 on ``inverted_double_pendulum.xml`` while the cart is more than 1 cm
     from the ends of the rail (at 1 m), which are not simulated. The last channel, the constraint
-    force on the cart, is therefore always zero. Speeds are reported clipped to 10; what is beyond,
-    :meth:`infer` cannot know.
+    force on the cart, is therefore always zero. Speeds are reported clipped to 10, so :meth:`infer`
+    does not recover larger ones.
 
-    The environment evaluates tip and constraint force where MuJoCo left them: at the last stage of
-    the last Runge-Kutta step. The twin evaluates the tip where the step ends, which is
+    The environment evaluates tip and constraint force at the last stage of the last Runge-Kutta
+    step, where MuJoCo left them. The twin evaluates the tip at the end of the step, which is
     :math:`O(h^3)` away.
 
-    Planning maximises the reward with the healthy reward divided by
+    Planning divides the healthy reward by
     :math:`1 + 0.4 (x/\mathrm{m})^2 + 0.5 (\sin^2\varphi_1 + \sin^2\varphi_2)`: the environment's
-    own reward hardly minds where the cart is, so a plan would run off the rail. The two are equal
-    where the reward is best, and staying up pays far beyond the rail: a cart that ran off is better
-    brought back than dropped.
+    own reward hardly depends on the position of the cart, so a plan would run off the rail. Both
+    rewards are equal at their maximum, and staying upright pays off far beyond the rail, so a plan
+    brings a cart back instead of dropping the poles.
 
-    :param healthy_reward: option; what each step in which the tip stays above 1 m earns
-    :param reset_noise_scale: option; positions start uniformly within this, speeds normally with
-        this
-        standard deviation
+    :param healthy_reward: option; reward for each step in which the tip stays above 1 m
+    :param reset_noise_scale: option; half width of the uniform initial positions, and standard
+        deviation of the normal initial speeds
     """
 
     name = "InvertedDoublePendulum"
@@ -177,13 +166,9 @@ class InvertedDoublePendulum(AnalyticTwin):
         flight = h_1 * jnp.sin(angle_1) * rate_1**2 + h_2 * jnp.sin(angle_2) * rate_2**2
         pole_2 = spin * rate_1**2 - pull_2
         pole_1 = pole_2 - spin * rate_2**2 - pull_1
-        return jnp.stack(
-            [
-                params["slider_damping"] * v[0] - flight - mass * g_x,
-                params["hinge_damping"] * v[1] + pole_1,
-                params["hinge2_damping"] * v[2] + pole_2,
-            ]
-        )
+        cart = params["slider_damping"] * v[0] - flight - mass * g_x
+        hinge = params["hinge_damping"] * v[1] + pole_1
+        return jnp.stack([cart, hinge, params["hinge2_damping"] * v[2] + pole_2])
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
         x, z = _tip(next_state, params)
@@ -212,7 +197,7 @@ class InvertedDoublePendulum(AnalyticTwin):
 
 
 def _moments(params: Params) -> tuple[Any, Any, Any]:
-    """First moments of mass about the two hinges, and what couples the poles."""
+    """First moments of mass about the two hinges, and the coupling of the poles."""
     m_1, m_2, l_1 = params["pole_mass"], params["pole2_mass"], params["pole_length"]
     h_2 = m_2 * params["pole2_com"]
     return m_1 * params["pole_com"] + m_2 * l_1, h_2, h_2 * l_1

@@ -6,24 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State, rk4
-from sb3_hds.core.types import (
-    Action,
-    Flag,
-    Force,
-    MassMatrix,
-    Obs,
-    Params,
-    Position,
-    Scalar,
-    Velocity,
-)
+from sb3_hds.core import Actuator, AnalyticTwin, Channel, Flag, Joint, Parameter, State, rk4
+from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position, Scalar, Velocity
 from sb3_hds.twins.environments import cart_and_poles
 
 _MAX_COMMAND = 3.0
 _MAX_ANGLE = 0.2  # [rad]
 
-# Deviations that cost one half in the planning reward.
+# Deviations that halve the planning reward.
 _RAIL = 1.0  # [m]
 _SPEED = 5.0  # [m/s]
 _RATE = 5.0  # [rad/s]
@@ -33,8 +23,8 @@ class InvertedPendulum(AnalyticTwin):
     r"""
     A pole balanced on a cart.
 
-    With the pole's centre of mass at :math:`r_x, r_z` from the hinge (it turns with :math:`\theta`,
-    and :math:`\theta = 0` is upright), in the plane and with gravity :math:`(g_x, -g)`:
+    With the pole's centre of mass at :math:`r_x, r_z` from the hinge (rotated by :math:`\theta`,
+    which is zero upright), and gravity :math:`(g_x, -g)` in the plane of motion:
 
     .. math::
         (m_c + m_p + a_s)\,\ddot x + m_p r_z \dot\omega - m_p r_x \omega^2
@@ -42,17 +32,17 @@ class InvertedPendulum(AnalyticTwin):
         m_p r_z \ddot x + (I + m_p r^2 + a_h)\,\dot\omega - m_p (g_x r_z + g r_x) + b_h \omega &= 0
 
     Reproduces MuJoCo's RK4 on ``inverted_pendulum.xml`` while no joint is at its limit. The ends of
-    the rail (at 1 m) are not simulated: there MuJoCo pushes back and the twin does not.
+    the rail (at 1 m) are not simulated.
 
     The reward is one until the pole leaves :math:`\pm 0.2` rad, so it has no gradient. Planning
-    maximises instead, always positive, at most one per step, and one only at rest in the middle:
+    maximises a positive reward that is one only at rest in the middle:
 
     .. math::
         r_\text{plan} = \Big(1 + \tfrac{1}{2}\Big[(\theta / 0.2\,\mathrm{rad})^2
             + (x / 1\,\mathrm{m})^2
             + (\dot x / 5\,\mathrm{m/s})^2 + (\omega / 5\,\mathrm{rad/s})^2\Big]\Big)^{-1}
 
-    :param reset_noise_scale: option; positions and speeds start uniformly within this
+    :param reset_noise_scale: option; half width of the uniform initial positions and speeds
     """
 
     name = "InvertedPendulum"
@@ -99,7 +89,7 @@ class InvertedPendulum(AnalyticTwin):
     @staticmethod
     def described_by(env: Any) -> dict[str, Any]:
         """
-        :return: parameters and options as the XML of ``env`` has them
+        :return: parameters and options from the XML of ``env``
         :raises EnvironmentMismatchError: for an XML of another structure
         """
         found = cart_and_poles.read(env, poles=1)
@@ -108,7 +98,7 @@ class InvertedPendulum(AnalyticTwin):
         return found
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
-        """Everything uniform in plus and minus ``reset_noise_scale``."""
+        """Positions and speeds uniform in plus and minus ``reset_noise_scale``."""
         noise = self.reset_noise_scale
         start = jax.random.uniform(key, (2, 2), minval=-noise, maxval=noise)
         return State(start[0], start[1], {})

@@ -11,10 +11,10 @@ from sb3_hds.twins.environments.inverted_pendulum import InvertedPendulum
 
 _MAX_COMMAND = 3.0
 _RAIL_END = 1.0  # [m]
-# MuJoCo's soft joint limit on a cart and pole of 15.5 kg, as a spring and a damper.
+# MuJoCo's soft joint limit for a cart and pole of 15.5 kg, as a spring and a damper.
 _END_STIFFNESS = 9.5e3  # [N/m]
 _END_DAMPING = 760.0  # [N s/m]
-# The damper sets in over this depth [m].
+# Depth over which the damper sets in [m].
 _SOFT = 0.005
 
 _SWING_UP_CHANNELS = (
@@ -28,22 +28,22 @@ _SWING_UP_CHANNELS = (
 
 class InvertedPendulumFriction(InvertedPendulum):
     r"""
-    :class:`InvertedPendulum` with the ends of its rail, and with another task as an option.
+    :class:`InvertedPendulum` with the ends of its rail, and a swing-up task as an option.
 
     The model is that of ``InvertedPendulum-v5``: the friction that the environment adds is hidden
     from :meth:`from_env`, and known to ``sb3_hds.envs.true_twin``. At the ends of the rail a spring
-    and a damper push back; MuJoCo's soft limit does nearly the same, so parity ends there.
+    and a damper push back; MuJoCo's soft limit is similar, but not equal.
 
-    With ``swing_up=True`` the pole starts hanging, nothing terminates, cosine and sine of the angle
-    are observed, and the reward, which has a gradient, is best upright in the middle:
+    With ``swing_up=True`` the pole starts hanging, episodes do not terminate, cosine and sine of
+    the angle are observed, and the reward has a gradient:
 
     .. math::
         r = \tfrac{1}{2}(1 + \cos\theta) - 0.1\,x^2 - 0.005\,\dot x^2 - 0.0005\,\omega^2
             - 0.001\,u^2
 
-    :param reset_noise_scale: option; positions and speeds start uniformly within this
-    :param swing_up: option; the task
-    :param rail_ends: option; whether there are any
+    :param reset_noise_scale: option; half width of the uniform initial positions and speeds
+    :param swing_up: option; whether the task is to swing up
+    :param rail_ends: option; whether the rail has ends
     """
 
     name = "InvertedPendulumFriction"
@@ -65,7 +65,7 @@ class InvertedPendulumFriction(InvertedPendulum):
         return cls(**found, swing_up=env.swing_up, rail_ends=env.rail_ends)
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
-        """Everything uniform in plus and minus ``reset_noise_scale``, from hanging or upright."""
+        """Uniform in plus and minus ``reset_noise_scale``, around hanging or upright."""
         start = super().initial(key, params)
         return start._replace(q=start.q.at[1].add(jnp.pi)) if self.swing_up else start
 
@@ -106,7 +106,7 @@ class InvertedPendulumFriction(InvertedPendulum):
 
 
 def _end_of_rail(x: Scalar, speed: Scalar) -> Scalar:
-    """What keeps the cart from going on beyond an end [N], as a load; never pulls."""
+    """The force of an end on the cart [N], as a load; it never pulls."""
     depth = jnp.maximum(jnp.abs(x) - _RAIL_END, 0.0)
     outwards = jnp.sign(x) * speed
     push = _END_STIFFNESS * depth + _END_DAMPING * outwards * jnp.minimum(depth / _SOFT, 1.0)

@@ -6,25 +6,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State
-from sb3_hds.core.types import (
-    Action,
-    Flag,
-    Force,
-    MassMatrix,
-    Obs,
-    Params,
-    Position,
-    Scalar,
-    Velocity,
-)
+from sb3_hds.core import Actuator, AnalyticTwin, Channel, Flag, Joint, Parameter, State
+from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position, Scalar, Velocity
 
 _MIN_POSITION = -1.2  # [m]
 _MAX_POSITION = 0.6  # [m]
 _MAX_SPEED = 0.07  # [m/s]
 _GOAL = 0.45  # [m]
 
-# Of the planning reward; see the class.
+# Constants of the planning reward; see the class.
 _SCALE = 10.0
 _CLIMB = 8.0
 _BONUS = 2.0
@@ -40,24 +30,23 @@ class MountainCar(AnalyticTwin):
 
     Reproduces ``gymnasium/envs/classic_control/continuous_mountain_car.py``: semi-implicit Euler
     with a step of one second, speed clipped to 0.07 m/s, position clipped to [-1.2, 0.6] m, and an
-    inelastic wall on the left. Where a clip is active, the derivative is zero. Like the
-    environment, the reward charges for the command before it is clipped.
+    inelastic wall on the left. Where a clip is active, the derivative is zero. As in the
+    environment, the reward charges for the command before clipping.
 
-    The reward says nothing about where the goal is, so planning climbs a potential instead. With
-    the energy :math:`E = v^2/2 + g \sin(3x)/3`, its fraction :math:`e` of what a climb from the
-    bottom of the valley to the goal at :math:`x_g` takes, and :math:`\operatorname{sp}` the
-    softplus,
+    The reward has no gradient towards the goal, so planning maximises the gain of a potential. With
+    the energy :math:`E = v^2/2 + g \sin(3x)/3`, its fraction :math:`e` of that of a climb from the
+    bottom of the valley to the goal at :math:`x_g`, and the softplus :math:`\operatorname{sp}`,
 
     .. math::
         \Phi = -8 \cdot 0.1 \operatorname{sp}\!\Big(\frac{1 - e}{0.1}\Big)
                + 2\,\sigma\!\Big(\frac{x - x_g}{0.05\,\mathrm{m}}\Big), \qquad
         r_\text{plan} = 10\,\big(\Phi(s') - \Phi(s) - 0.1\,u^2\big)
 
-    Energy beyond what the climb takes earns nothing more. The differences add up to the same number
-    on every way to the goal, and what is left is the cost of the commands, which the environment
-    charges too. The 8 decides how hard to push: more is faster, less is cheaper.
+    Energy beyond that of the climb earns nothing. The gains add up to the same number on every path
+    to the goal, so plans differ in the cost of their commands, which the environment charges too. A
+    larger factor than 8 makes plans faster, a smaller one cheaper.
 
-    :param goal_velocity: option; speed at the goal that ends the episode [m/s]
+    :param goal_velocity: option; minimal speed at the goal [m/s]
     """
 
     name = "MountainCar"

@@ -1,6 +1,4 @@
-"""Twin of ``sb3_hds/PayloadPendulum-v0``: a payload that hangs from a moved handle."""
-
-from typing import Any
+"""Twin of ``sb3_hds/PayloadPendulum-v0``: a payload that hangs from a driven handle."""
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +6,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, Parameter, State, rk4
 from sb3_hds.core.types import Action, Force, MassMatrix, Obs, Params, Position, Scalar, Velocity
-from sb3_hds.errors import ParameterError
 
 _MAX_SPEED = 2.0  # [m/s]
-_SERVO_TIME = 0.05  # [s] time constant with which the handle follows its commanded speed
-_HANDLE_MASS = 10.0  # [kg] shows only when an effect pushes the handle: the drive knows its load
+_SERVO_TIME = 0.05  # [s] time constant of the handle's speed
+_HANDLE_MASS = 10.0  # [kg] matters only for effects: the drive compensates the model's load
 
 # Weights of the cost on payload position, handle position, payload velocity and command.
 _WEIGHTS = {"stop": (0.0, 0.0, 1.0, 0.1), "stop_at_origin": (1.0, 1.0, 1.0, 0.1)}
@@ -29,21 +26,21 @@ class PayloadPendulum(AnalyticTwin):
         m l^2 \dot\omega + m l\,(\ddot x \cos\theta + (\ddot z + g) \sin\theta) + d\,\omega = 0,
         \qquad (\ddot x, \ddot z) = (u - (\dot x, \dot z)) / 0.05\,\mathrm{s}
 
-    The handle is driven by a servo that knows its load, damping included, so the payload never
-    pushes it back; it takes up a new velocity with a time constant of 0.05 s, where the paper
-    prescribes it at once. What the drive does not know, an effect, moves the handle too, as a body
-    of 10 kg. Integrated by RK4 in two sub-steps of 25 ms.
+    The servo of the handle compensates its load, damping included, so the payload does not push it
+    back. It reaches a new velocity with a time constant of 0.05 s; in the paper, immediately.
+    Effects are not compensated: they move the handle as a body of 10 kg. Integrated by RK4 in two
+    sub-steps of 25 ms.
 
-    The reward of the paper, with :math:`p` the payload's position relative to where it hangs when
-    the handle is in the origin, :math:`v` its velocity, and :math:`a` the command:
+    The reward of the paper, with the payload's position :math:`p` relative to hanging below the
+    origin, its velocity :math:`v`, and the command :math:`a`:
 
     .. math:: r = \frac{1}{0.1 + c}, \qquad
               c = \tfrac{1}{2}\big(w_p |p|^2 + w_x |x|^2 + w_v |v|^2 + w_a |a|^2\big)
 
-    The 0.1 is ours: it keeps the reward finite at the goal. So are the weights, which the paper
-    gives in an appendix: :math:`w_v = 1`, :math:`w_a = 0.1`, and :math:`w_p = w_x` is 0 for
-    ``"stop"`` and 1 for ``"stop_at_origin"``. Far from the goal the reward is flat, so planning
-    maximises :math:`-c`, which grows with it and is concave in position, velocity and command.
+    The 0.1, which keeps the reward finite at the goal, and the weights are ours: :math:`w_v = 1`,
+    :math:`w_a = 0.1`, and :math:`w_p = w_x` is 0 for ``"stop"`` and 1 for ``"stop_at_origin"``. Far
+    from the goal the reward is flat, so planning maximises :math:`-c`, which increases with it and
+    is concave in position, velocity and command.
 
     Source: Mora et al., *PODS: Policy Optimization via Differentiable Simulation*, ICML 2021,
     section 5.
@@ -59,6 +56,7 @@ class PayloadPendulum(AnalyticTwin):
     integrator = staticmethod(rk4)
     max_episode_steps = 100
     options = {"goal": "stop"}
+    choices = {"goal": _WEIGHTS}
     goal: str
     joints = (Joint("handle_x", "m"), Joint("handle_z", "m"), Joint("swing", "rad"))
     actuators = (
@@ -82,14 +80,6 @@ class PayloadPendulum(AnalyticTwin):
     }
     native_effects = {("viscous_friction", 2): {"b": "damping"}}
 
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings)
-        if self.goal not in _WEIGHTS:
-            raise ParameterError(
-                f"The goal of {self.name} must be one of {', '.join(map(repr, _WEIGHTS))}, "
-                f"got {self.goal!r}."
-            )
-
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         """Uniform: handle at rest within 1 m in x and z, swing within 1 rad and 2 rad/s."""
         high = jnp.array([[1.0, 1.0, 1.0], [0.0, 0.0, 2.0]])
@@ -105,7 +95,7 @@ class PayloadPendulum(AnalyticTwin):
         return jnp.concatenate([state.q[:2], jnp.cos(swing), jnp.sin(swing), state.v])
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:
-        """Computed torque: gives the handle the servo's acceleration, whatever the payload does."""
+        """Computed torque: the handle gets the servo's acceleration, whatever the payload does."""
         command = jnp.clip(action, -_MAX_SPEED, _MAX_SPEED)
         servo = (command - state.v[:2]) / _SERVO_TIME
         inertia = self.mass_matrix(state.q, params)
@@ -146,7 +136,7 @@ class PayloadPendulum(AnalyticTwin):
         return jnp.concatenate([grip, rod[None]]) + handle
 
     def _cost(self, state: State, action: Action, params: Params) -> Scalar:
-        """What the reward is one over."""
+        """The cost :math:`c` of the reward."""
         w_p, w_x, w_v, w_a = _WEIGHTS[self.goal]
         handle, length = state.q[:2], params["length"]
         sin, cos = jnp.sin(state.q[2]), jnp.cos(state.q[2])

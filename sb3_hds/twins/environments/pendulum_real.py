@@ -10,19 +10,19 @@ from sb3_hds.twins.environments.pendulum import Pendulum
 
 class PendulumReal(Pendulum):
     r"""
-    A rod swung up by a torque at its pivot, integrated finely.
+    A rod swung up by a torque at its pivot, integrated accurately.
 
     .. math::
         \Big(\tfrac{1}{3} m + m_p\Big) l^2 \dot\omega
         = \Big(\tfrac{1}{2} m + m_p\Big) g l \sin\theta - b\,\omega + u
 
-    The task, the observations and the constants are those of :class:`Pendulum`; the speed has no
-    limit, and four Runge-Kutta steps per control interval follow MuJoCo's engine to 1e-6.
-    :class:`Pendulum` steps by semi-implicit Euler: after a second, the same pendulum is elsewhere.
+    Task, observations and constants are those of :class:`Pendulum`; the speed has no limit. Four
+    Runge-Kutta steps per control interval agree with MuJoCo to 1e-6; the semi-implicit Euler steps
+    of :class:`Pendulum` deviate visibly within a second.
 
-    :meth:`from_env` reads what the data sheet of ``sb3_hds/PendulumReal-v1`` would say: gravity,
-    mass, length and damping. A payload at the tip, dry friction, drag, and what happens to commands
-    and measurements on their way are hidden from it: ``sb3_hds.envs.true_twin`` knows them too.
+    :meth:`from_env` reads the data sheet of ``sb3_hds/PendulumReal-v1``: gravity, mass, length and
+    damping. A payload at the tip, dry friction, drag, and effects on commands and measurements are
+    hidden from it, and known to ``sb3_hds.envs.true_twin``.
     """
 
     name = "PendulumReal"

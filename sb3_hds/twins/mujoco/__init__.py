@@ -1,7 +1,6 @@
 """Twins of robots from their model files."""
 
-from sb3_hds.twins.mujoco.files.several import write_models
-from sb3_hds.twins.mujoco.files.writing import Written, write_model
+from sb3_hds.twins.mujoco.files.writing import Written, write_model, write_models
 from sb3_hds.twins.mujoco.from_mujoco import from_mujoco
 from sb3_hds.twins.mujoco.matching import Matching, arranged, match
 from sb3_hds.twins.mujoco.mechanism import Mechanism

@@ -1,7 +1,7 @@
 r"""
-Commands to forces, as MuJoCo's actuators have it: motors, servos and DC motors without memory.
+MuJoCo's actuators without internal state: motors, servos and DC motors.
 
-All actuators of a kind are computed side by side. With their gears as the rows of :math:`T`,
+All actuators of a kind are computed as one array. With their gears as the rows of :math:`T`,
 lengths are :math:`T q`, speeds :math:`T v`, and generalised forces :math:`T^T f`.
 
 Source: MuJoCo documentation, *Computation*, Actuation model; *MuJoCo DC motor model*, Google
@@ -25,7 +25,7 @@ Each = Float[Array, " drives"]
 
 
 class Moving(NamedTuple):
-    """What actuators see of the mechanism: a joint's position is a turn where it is a ball."""
+    """The motion of the mechanism; ``coordinates`` has rotation vectors for ball joints."""
 
     q: Position
     coordinates: Coordinates
@@ -35,7 +35,7 @@ class Moving(NamedTuple):
 class Pull(NamedTuple):
     """
     :param force: of each actuator, before its gear
-    :param by_speed: slope of that by its own speed; 0 where a limit holds it
+    :param by_speed: derivative of the force by the actuator's speed; 0 at a limit of the force
     :param gear: shape ``(drives, dof)``
     """
 
@@ -68,7 +68,7 @@ class Actuation:
         return jnp.clip(total, *self.limits.T.astype(total.dtype))
 
     def slope(self, moving: Moving, command: Action, p: Params) -> MassMatrix:
-        """:return: of the force by the velocity, as an implicit integrator takes it"""
+        """:return: derivative of the force by the velocity, for an implicit integrator"""
         total = jnp.zeros((moving.v.shape[0],) * 2, moving.v.dtype)
         for pull in self._pulls(moving, command, p):
             total = total + (pull.gear.T * pull.by_speed) @ pull.gear
@@ -96,7 +96,7 @@ class _Drives:
         self.limits = np.array(
             [drive.force_limit or (-math.inf, math.inf) for drive in self.drives]
         ).T
-        #: of each input: rows that have it, index among all commands, and limits
+        #: by name of the input: row of the drive, index among all commands, and limits
         self.inputs: dict[str, list[tuple[int, int, tuple[float, float]]]] = {}
         for row, (first, drive) in enumerate(drives):
             for j, (name, limits) in enumerate(zip(drive.inputs, drive.ranges, strict=True)):
@@ -104,7 +104,7 @@ class _Drives:
                 self.inputs.setdefault(name, []).append(place)
 
     def given(self, name: str, command: Action) -> Each:
-        """:return: one input of each, zero where it has none"""
+        """:return: an input of each drive; zero for drives without it"""
         if name not in self.inputs:
             return jnp.zeros(self.n, command.dtype)
         rows, index, limits = zip(*self.inputs[name], strict=True)
@@ -115,9 +115,9 @@ class _Drives:
         """:return: gears, lengths and speeds"""
         gear: Any = self.gear.astype(moving.v.dtype)
         for i, (link, drive) in enumerate(zip(self.links, self.drives, strict=True)):
-            if drive.outer and link.kind in (BALL, FREE):
-                start, turning = link.q + link.n_q - 4, np.array(link.dofs[-3:])
-                rows = algebra.rotation(tuple(moving.q[start : start + 4]))
+            if drive.outer and link.quaternion:
+                turning = np.array(link.dofs[-3:])
+                rows = algebra.rotation(tuple(moving.q[link.quaternion]))
                 axis = jnp.stack(
                     [jnp.sum(jnp.stack(x) * gear[i, turning]) for x in zip(*rows, strict=True)]
                 )
@@ -126,7 +126,7 @@ class _Drives:
         return gear, length, gear @ moving.v
 
     def of(self, p: Params, name: str, otherwise: Any, like: Array) -> Each:
-        """:return: a parameter of each actuator, or a number where it is none"""
+        """:return: a parameter of each drive; its entry in ``otherwise`` if it has none"""
         return jnp.stack(
             [
                 jnp.asarray(p.get(f"{drive.name}_{name}", number), like.dtype)
@@ -150,15 +150,11 @@ class _Servos(_Drives):
         self.gain, self.bias = (
             np.array([getattr(drive, name) for drive in self.drives]).T for name in ("gain", "bias")
         )
-        # At a ball joint, targets that are whole turns apart are the same.
-        self.period = np.array(
-            [
-                2.0 * math.pi * math.hypot(*drive.gear)
-                if link.kind == BALL and drive.role == "position"
-                else 0.0
-                for link, drive in zip(self.links, self.drives, strict=True)
-            ]
-        )
+        # At a ball joint, targets that differ by full turns are the same.
+        pairs = zip(self.links, self.drives, strict=True)
+        turning = [link.kind == BALL and drive.role == "position" for link, drive in pairs]
+        sizes = [math.hypot(*drive.gear) for drive in self.drives]
+        self.period = np.where(turning, 2.0 * math.pi * np.array(sizes), 0.0)
 
     def pull(self, moving: Moving, command: Action, p: Params) -> Pull:
         gear, length, speed = self.geared(moving)
@@ -184,12 +180,13 @@ class _Servos(_Drives):
         force = (g0 + g1 * length + g2 * speed) * u + bias
         return Pull(*self.limited(force, g2 * u + b2), gear)
 
-    def _nearest(self, wanted: Each, length: Each) -> Each:
+    def _nearest(self, target: Each, length: Each) -> Each:
+        """The equivalent target nearest to the length."""
         if not self.period.any():
-            return wanted
+            return target
         period = np.where(self.period > 0.0, self.period, 1.0).astype(length.dtype)
-        nearest = wanted - period * jnp.round((wanted - length) / period)
-        return jnp.where(self.period > 0.0, nearest, wanted)
+        nearest = target - period * jnp.round((target - length) / period)
+        return jnp.where(self.period > 0.0, nearest, target)
 
 
 class _Motors(_Drives):

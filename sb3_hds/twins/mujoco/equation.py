@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from sb3_hds.core import Force, MassMatrix, Params, Position, Velocity
 from sb3_hds.core.numerics.linear import Factor, factorised, solve_factored
-from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Link, Mechanism, Place
+from sb3_hds.twins.mujoco.mechanism import FREE, Link, Mechanism, Place
 from sb3_hds.twins.mujoco.parameters import bodies_of, compensated, gravity_of, of_plant, typical
 from sb3_hds.twins.mujoco.rigid_body.dynamics import (
     Configuration,
@@ -27,9 +27,9 @@ from sb3_hds.twins.mujoco.rigid_body.quaternions import turn_between, turning
 
 # Speed over which dry friction builds up [rad/s] or [m/s].
 _STANDSTILL = 0.01
-# Of joints, besides their armature.
+# Parameters of joints besides their armature.
 _OF_JOINTS = ("damping", "frictionloss", "stiffness")
-# Squared speed, in units of that, below which the series of tanh(x) / x is exact to 1e-16.
+# Squared x below which two terms of the series of tanh(x) / x suffice.
 _SMALL = 1e-6
 
 
@@ -38,18 +38,18 @@ class Equation:
     :math:`M(q)\,\dot v + c(q, v) = \tau`, with the model's damping, dry friction and springs in
     :math:`c`.
 
-    Of :math:`\dot v = (M + C)^{-1} (\tau - c)` the derivative is taken through inverse dynamics:
+    The derivative of :math:`\dot v = (M + C)^{-1} (\tau - c)` is that of inverse dynamics:
 
     .. math:: (M + C)\,d\dot v = d\tau - dC\,\dot v
               - \frac{\partial (M \dot v + c)}{\partial (q, v, p)}\,d(q, v, p)
 
-    so that neither the mass matrix nor its factors are differentiated, and all directions share
-    the slopes of inverse dynamics, which are written down.
+    so neither the mass matrix nor its factors are differentiated, and all directions share the
+    analytical derivatives of inverse dynamics.
 
     Source: Carpentier and Mansard, *Analytical derivatives of rigid body dynamics algorithms*,
     Robotics: Science and Systems 2018.
 
-    :param payload: where an unknown mass may be
+    :param payload: place of an unknown mass
     :param masses: whether mass, centre and inertia of each body are parameters
     """
 
@@ -61,7 +61,7 @@ class Equation:
         self._inertial = tuple(name for name in self.parameters if name not in joints)
         self._compensated = compensated(mechanism)
         powers = [row[1:] for link in mechanism.links for row in link.damping]
-        #: coefficients of powers of the speed, from the second on, by degree of freedom
+        #: damping coefficients of the speed squared, cubed, ..., by degree of freedom
         self._powers = np.array(list(zip_longest(*powers, fillvalue=0.0)))
         self._tree_of = cache(lambda dtype: Tree(mechanism.links, dtype))
         self.mass_matrix = jax.jit(self._mass_matrix)
@@ -71,7 +71,7 @@ class Equation:
     def bias(self, q: Position, v: Velocity, params: Params, step: float) -> Force:
         """
         :param step: see :meth:`resistance`
-        :return: the force that would keep the mechanism from accelerating
+        :return: the force at which the acceleration is zero
         """
         load = self._inverse_dynamics(q, v, self._typed(params, q))
         return load + self._load_of_joints(q, v, params, step)
@@ -96,10 +96,10 @@ class Equation:
 
     def resistance(self, v: Velocity, params: Params, step: float) -> tuple[Force, Force]:
         """
-        :param step: length of the explicit step [s]: dry friction is smoothed over what that can
-            stop; 0 where the integrator takes it at the end of its step
-        :return: damping and dry friction of each joint, per speed; and the slope by the speed that
-            an implicit integrator takes: of dry friction the secant, which never overshoots
+        :param step: length of the explicit step [s]: dry friction is smoothed over the speed that
+            it can stop; 0 if the integrator takes friction at the end of its step
+        :return: damping and dry friction of each joint, per speed; and their derivative by the
+            speed for an implicit integrator: for dry friction the secant, which never overshoots
         """
         powers = self._powers.astype(v.dtype)
         dry = self._by_dof(params, "frictionloss", v)
@@ -124,7 +124,7 @@ class Equation:
         return solve_factored(factor, force - self._inverse(q, v, p)), factor
 
     def _with_derivative(self) -> Any:
-        """Forward dynamics, whose derivative is that of inverse dynamics."""
+        """Forward dynamics with the derivative of inverse dynamics."""
 
         @jax.custom_jvp
         def acceleration(q: Array, v: Array, force: Array, coupling: Array, p: Any) -> Array:
@@ -139,37 +139,33 @@ class Equation:
                 tree, gravity = self._tree_of(q.dtype), gravity_of(self.mechanism, p)
                 by_q, by_v = derivatives(tree, self._configuration(q, p), v, gravity, a)
                 if not _zero(dq):
-                    right = right - jnp.sum(by_q * self.way_of(q, dq), -1)
+                    right = right - jnp.sum(by_q * self.tangent_of(q, dq), -1)
                 if not _zero(dv):
                     right = right - jnp.sum(by_v * dv, -1)
             if not _zero(dc):
                 right = right - jnp.sum(dc * a, -1)
-            changes = {name: way for name, way in dp.items() if not _zero(way)}
+            changes = {name: change for name, change in dp.items() if not _zero(change)}
             if changes:
                 values = {name: p[name] for name in changes}
-                needed = lambda own: self._inverse(q, v, p | own, a)  # noqa: E731
-                right = right - jax.jvp(needed, (values,), (changes,))[1]
+                force = lambda own: self._inverse(q, v, p | own, a)  # noqa: E731
+                right = right - jax.jvp(force, (values,), (changes,))[1]
             return a, solve_factored(factor, right)
 
         acceleration.defjvp(rule, symbolic_zeros=True)
         return acceleration
 
-    def way_of(self, q: Position, change: Array) -> Array:
-        """:return: the ways and turns that a change of the numbers of a position makes"""
+    def tangent_of(self, q: Position, change: Array) -> Array:
+        """:return: the tangent vector, with rotation vectors, of a change of position numbers"""
         if not self._tree_of(q.dtype).has_balls:
             return change
         parts = []
         for link in self.mechanism.links:
-            start = link.q + (3 if link.kind == FREE else 0)
-            if link.kind in (BALL, FREE):
-                parts.append(change[link.q : start])
-                turn = slice(start, start + 4)
-                parts.append(turning(q[turn], change[turn]))
-            else:
-                parts.append(change[link.q : link.q + 1])
+            parts.append(change[link.straight])
+            if link.quaternion:
+                parts.append(turning(q[link.quaternion], change[link.quaternion]))
         return jnp.concatenate(parts)
 
-    # --- its parts
+    # --- terms
 
     def _typed(self, params: Params, like: Array) -> dict[str, Array]:
         return {name: jnp.asarray(params[name], like.dtype) for name in self._inertial}
@@ -194,31 +190,29 @@ class Equation:
         return load
 
     def _by_dof(self, p: Any, name: str, like: Array) -> Array:
-        """A parameter of joints, zero where they have none."""
-        every = [(f"{link.joint}_{name}", len(link.dofs)) for link in self.mechanism.links]
-        values = [p.get(full, 0.0) for full, n in every for _ in range(n)]
+        """A parameter of joints by degree of freedom; zero for joints without it."""
+        values = [p.get(f"{x.joint}_{name}", 0.0) for x in self.mechanism.links for _ in x.dofs]
         return jnp.stack([jnp.asarray(value, like.dtype) for value in values])
 
 
 def _spring(link: Link, q: Array, linear: Any) -> Array:
     """The load of a joint's spring, by degree of freedom."""
 
-    def pull(way: Array, far: Array) -> Array:
-        stiffness, power = linear, far
+    def pull(deflection: Array, size: Array) -> Array:
+        stiffness, power = linear, size
         for coefficient in link.stiffness[1:]:
-            stiffness, power = stiffness + coefficient * power, power * far
-        return stiffness * way
+            stiffness, power = stiffness + coefficient * power, power * size
+        return stiffness * deflection
 
-    rest = jnp.asarray(link.rest, q.dtype)
-    here = q[link.q : link.q + len(link.rest)]
-    if link.kind not in (BALL, FREE):
+    rest, here = jnp.asarray(link.rest, q.dtype), q[link.in_q]
+    if not link.quaternion:
         return pull(here - rest, here - rest)
     turn = turn_between(here[-4:], rest[-4:])
-    ways = [here[:3] - rest[:3], turn] if link.kind == FREE else [turn]
-    # Only a spring of higher order asks how far it is stretched, which has a kink at rest.
-    curved = len(link.stiffness) > 1
-    size = lambda way: jnp.sqrt(jnp.sum(way**2)) if curved else jnp.zeros(())  # noqa: E731
-    return jnp.concatenate([pull(way, size(way)) for way in ways])
+    deflections = [here[:3] - rest[:3], turn] if link.kind == FREE else [turn]
+    # Only nonlinear springs need the size of a deflection, which has a kink at rest.
+    nonlinear = len(link.stiffness) > 1
+    size = lambda x: jnp.sqrt(jnp.sum(x**2)) if nonlinear else jnp.zeros(())  # noqa: E731
+    return jnp.concatenate([pull(x, size(x)) for x in deflections])
 
 
 def _tanh_per(v: Array, width: Array) -> Array:

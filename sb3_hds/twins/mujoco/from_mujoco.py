@@ -12,7 +12,7 @@ from sb3_hds.twins.mujoco.files.reading import integrator_of, n_actuators, read
 from sb3_hds.twins.mujoco.files.refusals import refuse
 from sb3_hds.twins.mujoco.files.shapes import shapes_of
 from sb3_hds.twins.mujoco.identifiability import unidentifiable
-from sb3_hds.twins.mujoco.mechanism import BALL, FREE, Drive, Link, Mechanism
+from sb3_hds.twins.mujoco.mechanism import Drive, Link, Mechanism
 from sb3_hds.twins.mujoco.twin import MechanismTwin, Reward, Terminated
 
 _KINDS = ("torque", "position", "velocity")
@@ -35,34 +35,34 @@ def from_mujoco(
     """
     A twin of a model that MuJoCo can load, without contacts.
 
-    Its parameters carry the names and words of the file: ``elbow_damping``, ``elbow_frictionloss``,
+    Parameters have the names of the file: ``elbow_damping``, ``elbow_frictionloss``,
     ``elbow_armature``, ``elbow_servo_kp``.
 
     :param model_or_path_or_env: path or text of an MJCF or URDF file (meshes may be missing where
         inertials are given), an ``MjSpec`` or ``MjModel``, or a MuJoCo environment of Gymnasium
     :param engine: ``"smooth"``, or ``"auto"``, which is the same
-    :param actuators: for a model that names none, or to replace them: ``"torque"`` (the default of
-        a URDF) for a motor at each hinge and slide, within its effort limit; or a mapping such as
-        ``{"kind": "position", "kp": 20.0, "kv": 1.5}``, whose commands are targets. Each value is
-        one number, or a mapping from joints to numbers; ``limit`` is of the force.
+    :param actuators: for a model without actuators, or to replace them: ``"torque"`` (default for a
+        URDF) for a motor at each hinge and slide, within its effort limit; or a mapping such as
+        ``{"kind": "position", "kp": 20.0, "kv": 1.5}``, whose commands are targets. A value is one
+        number, or a mapping from joints to numbers; ``limit`` is that of the force.
     :param dt: control interval [s]; default: the environment's, or the model's time step
     :param integrator: ``"euler"``, ``"implicitfast"`` or ``"rk4"``; default: the model's, or
         ``"implicitfast"`` for a URDF
     :param observe: ``"qv"`` for positions and velocities, ``"q"`` for positions only
-    :param payload: name of a site or body: an unknown mass may be there, or near it
+    :param payload: name of a site or body at which, or near which, an unknown mass may be
     :param masses: whether mass, centre and inertia of each body are parameters, too; a warning
         lists those that no motion can identify
     :param reward: of a task: ``reward(state, action, next_state, params)``
-    :param terminated: when a task ends: ``terminated(state, params)``
-    :param ignore: what the model has and the twin may do without: ``"contacts"`` where nothing
-        touches in the data, ``"equality"``, ``"fluid"``, ``"limits"``, ``"tendons"``
-    :raises ModelFileError: for a file that cannot be read, or a model with more than that
-    :raises ParameterError: for actuators, an integrator or a payload that make no sense
+    :param terminated: termination of a task: ``terminated(state, params)``
+    :param ignore: features of the model that the twin omits: ``"contacts"`` if there are none in
+        the data, ``"equality"``, ``"fluid"``, ``"limits"``, ``"tendons"``
+    :raises ModelFileError: for a file that cannot be read, or unsupported features of the model
+    :raises ParameterError: for invalid actuators, integrator or payload
     """
     if engine not in ("auto", "smooth"):
         raise ParameterError(
-            "engine must be 'smooth' or 'auto': MuJoCo's own engine, with contacts, does not serve "
-            f"as a twin yet; got {engine!r}. Where nothing touches, pass ignore=['contacts']."
+            "engine must be 'smooth' or 'auto': MuJoCo's own engine, with contacts, is not a twin "
+            f"yet; got {engine!r}. If there are no contacts in the data, pass ignore=['contacts']."
         )
     loaded = load(model_or_path_or_env)
     if integrator is None:
@@ -71,23 +71,21 @@ def from_mujoco(
     refuse(loaded.model, integrator, ignore)
     if loaded.mimics and not loaded.model.neq and "equality" not in ignore:
         raise ModelFileError(
-            f"Joints follow others ({', '.join(loaded.mimics)}), which the twin does not simulate: "
-            "they would move apart. To leave that out, pass ignore=['equality']."
+            f"Joints mimic others ({', '.join(loaded.mimics)}), which the twin does not simulate: "
+            "they would move independently. To accept that, pass ignore=['equality']."
         )
     mechanism = read(loaded.model, integrator=integrator)
+    changes: dict[str, Any] = {}
     if loaded.drawn is not None:
-        shapes = shapes_of(loaded.drawn, mechanism.places)
-        mechanism = dataclasses.replace(mechanism, shapes=shapes)
+        changes["shapes"] = shapes_of(loaded.drawn, mechanism.places)
     if "limits" in ignore:
-        links = (dataclasses.replace(link, limit=None) for link in mechanism.links)
-        mechanism = dataclasses.replace(mechanism, links=tuple(links))
+        changes["links"] = tuple(dataclasses.replace(x, limit=None) for x in mechanism.links)
     if actuators is None and not n_actuators(loaded.model):
         actuators = "torque"
     if actuators is not None:
-        drives = tuple(_drives(mechanism, actuators))
-        mechanism = dataclasses.replace(mechanism, drives=drives)
+        changes["drives"] = tuple(_drives(mechanism, actuators))
     twin = MechanismTwin(
-        mechanism,
+        dataclasses.replace(mechanism, **changes),
         observe=observe,
         payload=payload,
         masses=masses,
@@ -101,7 +99,7 @@ def from_mujoco(
 
 
 def _drives(mechanism: Mechanism, wanted: str | Mapping[str, Any]) -> list[Drive]:
-    """One at each hinge and slide."""
+    """A drive at each hinge and slide."""
     given = {"kind": wanted} if isinstance(wanted, str) else dict(wanted)
     kind = str(given.pop("kind", None))
     gains = {"torque": (), "position": ("kp", "kv"), "velocity": ("kv",)}.get(kind)
@@ -117,7 +115,7 @@ def _drives(mechanism: Mechanism, wanted: str | Mapping[str, Any]) -> list[Drive
             f"actuators of kind '{kind}' take {', '.join((*gains, 'limit'))}"
             + (f", not {', '.join(unknown)}." if unknown else f"; {missing[0]} is missing.")
         )
-    joints = [link for link in mechanism.links if link.kind not in (BALL, FREE)]
+    joints = [link for link in mechanism.links if not link.quaternion]
     values = {name: _by_joint(name, value, joints) for name, value in given.items()}
     index = {link.joint: i for i, link in enumerate(mechanism.links)}
     found = []
@@ -143,7 +141,7 @@ def _drives(mechanism: Mechanism, wanted: str | Mapping[str, Any]) -> list[Drive
 
 
 def _by_joint(name: str, value: Any, joints: Sequence[Link]) -> dict[str, float]:
-    """A number for each joint, from one for all or a mapping."""
+    """One number for each joint, from a mapping or a common value."""
     known = [link.joint for link in joints]
     if not isinstance(value, Mapping):
         value = dict.fromkeys(known, value)

@@ -5,16 +5,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.twins.mujoco.parameters import bodies_of, compensated, gravity_of, random_positions
+from sb3_hds.errors import first_names
+from sb3_hds.twins.mujoco.parameters import (
+    bodies_of,
+    compensated,
+    gravity_of,
+    of_body,
+    random_positions,
+)
 from sb3_hds.twins.mujoco.rigid_body.dynamics import Tree, configuration, inverse_dynamics
 
 if TYPE_CHECKING:
     from sb3_hds.twins.mujoco.twin import MechanismTwin
 
 _N_MOTIONS = 64
-# Of a parameter's scale, along the imaginary axis: the derivative is exact to rounding.
+# Complex step, in scales of a parameter: the derivative is exact to rounding.
 _STEP = 1e-20
-# Shares of the largest singular value, and of a direction, that are rounding.
+# Singular values below this share of the largest, and entries of unit vectors below this, are zero.
 _RANK, _SHARE = 1e-9, 1e-5
 _FEW = 6
 
@@ -22,7 +29,7 @@ _FEW = 6
 def unidentifiable(twin: "MechanismTwin") -> str:
     """
     :return: a sentence on the masses, centres, inertias and armatures that no data can identify, or
-        only in combination; empty if there are none
+        only in combinations; empty if there are none
 
     Source: Khalil and Dombre, *Modeling, Identification and Control of Robots*, Kogan Page 2002,
     section 9.4.
@@ -30,43 +37,40 @@ def unidentifiable(twin: "MechanismTwin") -> str:
     names = inertial(twin)
     slopes = regressor(twin, names)
     size = np.linalg.norm(slopes, axis=0)
-    nothing = [
-        name for name, length in zip(names, size, strict=True) if length < _RANK * size.max()
-    ]
-    seen = [i for i, name in enumerate(names) if name not in nothing]
-    _, values, ways = np.linalg.svd(slopes[:, seen] / size[seen], full_matrices=True)
-    rank = int(np.sum(values > _RANK * values[0]))
-    alone = np.linalg.norm(ways[rank:], axis=0) < _SHARE
-    together = [names[i] for i, free in zip(seen, alone, strict=True) if not free]
+    visible = size >= _RANK * size.max()
+    scaled = slopes[:, visible] / size[visible]
+    _, values, directions = np.linalg.svd(scaled, full_matrices=True)
+    null_space = directions[int(np.sum(values > _RANK * values[0])) :]
+    combined = np.linalg.norm(null_space, axis=0) >= _SHARE
+    idle = np.array(names)[~visible].tolist()
+    together = np.array(names)[visible][combined].tolist()
     parts = []
-    if nothing:
-        parts.append(f"{len(nothing)} change nothing ({_some(nothing)})")
+    if idle:
+        parts.append(f"{len(idle)} change nothing ({first_names(idle, _FEW)})")
     if together:
         parts.append(
-            f"{len(together)} act only in {len(together) - (len(seen) - rank)} combinations "
-            f"({_some(together)})"
+            f"{len(together)} act only in {len(together) - len(null_space)} combinations "
+            f"({first_names(together, _FEW)})"
         )
     if not parts:
         return ""
     return (
-        f"Of {len(names)} inertial parameters of {twin.name}, {', and '.join(parts)}: no data tell "
-        "these one by one. Free fewer of them, or calibrate with a prior."
+        f"Of {len(names)} inertial parameters of {twin.name}, {', and '.join(parts)}: no data can "
+        "identify these one by one. Estimate fewer of them, or calibrate with a prior."
     )
 
 
 def inertial(twin: "MechanismTwin") -> list[str]:
-    """:return: names of the parameters that shape masses and inertias"""
+    """:return: names of the parameters of masses and inertias"""
     mechanism = twin.mechanism
-    bodies = [link.body.name for link in mechanism.links if link.body]
-    ends = ["mass", *(f"com_{x}" for x in "xyz"), *(f"stretch_{x}" for x in "xyz")]
-    ends += ["shear_xy", "shear_xz", "shear_yz"]
-    found = [f"{body}_{end}" for body in bodies for end in ends]
+    bodies = [link.body for link in mechanism.links if link.body]
+    found = [name for body in bodies for name in of_body(body)]
     found += [f"{link.joint}_armature" for link in mechanism.links]
     return [name for name in found if name in twin.parameters]
 
 
 def regressor(twin: "MechanismTwin", names: list[str]) -> Float[np.ndarray, "rows p"]:
-    """:return: slopes of the forces that random motions need, by parameters in their scales"""
+    """:return: derivatives of inverse dynamics of random motions by the scaled parameters"""
     mechanism = twin.mechanism
     tree, rng = Tree(mechanism.links), np.random.default_rng(0)
     q = random_positions(mechanism, _N_MOTIONS)
@@ -86,8 +90,3 @@ def regressor(twin: "MechanismTwin", names: list[str]) -> Float[np.ndarray, "row
         force = inverse_dynamics(tree, at, v, gravity_of(mechanism, values), a)
         columns.append(np.imag(force).ravel() / _STEP)
     return np.stack(columns, 1)
-
-
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - _FEW} more" if len(names) > _FEW else ""
-    return ", ".join(names[:_FEW]) + more

@@ -1,4 +1,4 @@
-"""Match the columns of a log to the signals of a twin: by names of joints, never by their order."""
+"""Match the columns of a log to the signals of a twin, by names of joints, never by order."""
 
 import dataclasses
 import re
@@ -10,11 +10,10 @@ import numpy as np
 
 from sb3_hds.core import Trajectories
 from sb3_hds.errors import TrajectoryError
-from sb3_hds.twins.mujoco.mechanism import BALL, FREE
 from sb3_hds.twins.mujoco.twin import MechanismTwin
 
 _POSITION, _VELOCITY, _EFFORT, _COMMAND = "position", "velocity", "effort", "command"
-# What logs call them, in ROS, LeRobot and elsewhere.
+# Their names in logs of ROS, LeRobot and others.
 _WORDS = {
     _POSITION: ("position", "positions", "pos", "qpos", "q", "angle", "angles"),
     _VELOCITY: ("velocity", "velocities", "vel", "qvel", "qd", "dq", "speed", "rate"),
@@ -25,18 +24,18 @@ _WORDS = {
     ),
 }
 _KIND_OF = {word: kind for kind, words in _WORDS.items() for word in words}
-# Words that tell no joint from another.
-_IDLE = {"joint", "joints", "state", "states", "observation", "obs"}
+# Words that do not distinguish joints.
+_IGNORED = {"joint", "joints", "state", "states", "observation", "obs"}
 _COMMANDS = {"position": _POSITION, "velocity": _VELOCITY, "motor": _EFFORT, "dcmotor": _EFFORT}
 
 
 @dataclasses.dataclass(frozen=True)
 class Matching:
     """
-    :param obs: for each channel of the twin, the column that holds it; None if there is none
-    :param actions: likewise for each actuator
+    :param obs: the column of each channel of the twin; None if there is none
+    :param actions: the column of each actuator; None if there is none
     :param missing: channels and actuators without a column, each with the nearest unused columns
-    :param unused: columns that belong to none
+    :param unused: columns without a channel or actuator
     """
 
     obs: tuple[str | None, ...]
@@ -46,7 +45,7 @@ class Matching:
 
     def columns(self) -> dict[str, list[dict[str, str]]]:
         """
-        :return: what ``Trajectories.load(files, columns)`` takes, but for the column of time
+        :return: ``columns`` for ``Trajectories.load``, without the column of time
         :raises TrajectoryError: if anything is missing
         """
         self.check()
@@ -71,17 +70,17 @@ class Matching:
 def match(twin: MechanismTwin, names: Iterable[str]) -> Matching:
     """
     :param twin: made from a model file
-    :param names: of columns, as ``"/joint_states:position[elbow_joint]"``, ``"elbow.pos"``,
-        ``"dq_elbow"``; where no word says what of a joint it is, its position
+    :param names: of columns, such as ``"/joint_states:position[elbow_joint]"``, ``"elbow.pos"``,
+        ``"dq_elbow"``; a name without a word for the quantity means the position
     """
     columns = list(dict.fromkeys(names))
-    parsed = {name: _Parsed.by(name) for name in columns}
+    parsed = {name: _Parsed.of(name) for name in columns}
     taken: set[str] = set()
 
     def found(joint: str, kinds: Sequence[frozenset[str]]) -> str | None:
         for kind in kinds:
             alike = [name for name in columns if name not in taken and parsed[name].kinds == kind]
-            scores = {name: parsed[name].fits(joint) for name in alike}
+            scores = {name: parsed[name].score(joint) for name in alike}
             best = max(scores.values(), default=0.0)
             first = [name for name, score in scores.items() if score == best > 0.0]
             if len(first) == 1:
@@ -90,16 +89,16 @@ def match(twin: MechanismTwin, names: Iterable[str]) -> Matching:
         return None
 
     signals = _signals(twin)
-    # Longer names first: what belongs to left_elbow is not that of elbow.
+    # Longer names first: a column of left_elbow does not belong to elbow.
     order = sorted(range(len(signals)), key=lambda i: -len(_tokens(signals[i][1])))
     hits: dict[int, str | None] = {}
     for i in order:
         _, joint, kinds = signals[i]
         hits[i] = found(joint, kinds)
-    # What else a name says must be a prefix of all, as of a namespace: right_elbow is no elbow.
-    beside = {i: parsed[name].beside(signals[i][1]) for i, name in hits.items() if name is not None}
-    if len(set(beside.values())) > 1:
-        hits |= {i: None for i, more in beside.items() if more}
+    # Other words must be the same in all names, like a namespace: right_elbow is not elbow.
+    rest = {i: parsed[name].rest(signals[i][1]) for i, name in hits.items() if name is not None}
+    if len(set(rest.values())) > 1:
+        hits |= {i: None for i, words in rest.items() if words}
         taken = {name for name in hits.values() if name is not None}
     unused = tuple(name for name in columns if name not in taken)
     n = len(twin.channels)
@@ -108,26 +107,26 @@ def match(twin: MechanismTwin, names: Iterable[str]) -> Matching:
         for i, (name, _, _) in enumerate(signals)
         if hits[i] is None
     )
-    both = [hits[i] for i in range(len(signals))]
-    return Matching(tuple(both[:n]), tuple(both[n:]), missing, unused)
+    matched = [hits[i] for i in range(len(signals))]
+    return Matching(tuple(matched[:n]), tuple(matched[n:]), missing, unused)
 
 
 def arranged(twin: MechanismTwin, data: Trajectories) -> Trajectories:
     """
     :param data: read from a log, with the names of its columns in ``data.report``
-    :return: its columns in the order of the twin's channels and actuators
+    :return: the data with columns in the order of the twin's channels and actuators
     :raises TrajectoryError: if a channel or actuator has no column, with the nearest names, or if
-        the data do not carry names
+        the data have no names
     """
     report: Any = data.report
     if report is None:
         raise TrajectoryError(
-            "These data do not carry the names of their columns, so joints cannot be matched by "
-            "name. Read them from their log: Trajectories.load(files, columns)."
+            "These data do not carry the names of their columns, so joints cannot be matched. Read "
+            "them from their log: Trajectories.load(files, columns)."
         )
-    found = match(twin, [*report.obs, *(f"{name} command" for name in report.actions)])
-    found.check()
     actions = [f"{name} command" for name in report.actions]
+    found = match(twin, [*report.obs, *actions])
+    found.check()
     obs_at = [report.obs.index(str(name)) for name in found.obs]
     actions_at = [actions.index(str(name)) for name in found.actions]
     return dataclasses.replace(
@@ -140,26 +139,26 @@ def arranged(twin: MechanismTwin, data: Trajectories) -> Trajectories:
 
 @dataclasses.dataclass(frozen=True)
 class _Parsed:
-    """The parsed name of a column."""
+    """The words of a column's name."""
 
     joint: tuple[str, ...]
     kinds: frozenset[str]
 
     @classmethod
-    def by(cls, name: str) -> "_Parsed":
+    def of(cls, name: str) -> "_Parsed":
         words = _tokens(name)
         kinds = frozenset(_KIND_OF[word] for word in words if word in _KIND_OF)
-        joint = tuple(word for word in words if word not in _KIND_OF and word not in _IDLE)
+        joint = tuple(word for word in words if word not in _KIND_OF and word not in _IGNORED)
         return cls(joint, kinds or frozenset([_POSITION]))
 
-    def beside(self, joint: str) -> tuple[str, ...]:
-        """:return: words that are not those of the joint"""
-        own = _Parsed.by(joint).joint
+    def rest(self, joint: str) -> tuple[str, ...]:
+        """:return: words that are not in the name of the joint"""
+        own = _Parsed.of(joint).joint
         return tuple(word for word in self.joint if word not in own)
 
-    def fits(self, joint: str) -> float:
-        """:return: 0 if it is of another joint; more, the less else is said"""
-        wanted = _Parsed.by(joint).joint
+    def score(self, joint: str) -> float:
+        """:return: 0 for another joint, otherwise the share of the joint's words in the name"""
+        wanted = _Parsed.of(joint).joint
         n = len(wanted)
         if not n or not self.joint:
             return float(self.joint == wanted)
@@ -168,7 +167,7 @@ class _Parsed:
 
 
 def _signals(twin: MechanismTwin) -> list[tuple[str, str, list[frozenset[str]]]]:
-    """Channels, then actuators: name, joint, and what a column may say that it holds."""
+    """Channels, then actuators: name, joint, and the quantities that a column may have."""
     found: list[tuple[str, str, list[frozenset[str]]]] = []
     for channel in twin.channels:
         moving = channel.name.endswith(f"_{_VELOCITY}")
@@ -180,7 +179,7 @@ def _signals(twin: MechanismTwin) -> list[tuple[str, str, list[frozenset[str]]]]
         kinds = [frozenset([_COMMAND, kind]), frozenset([_COMMAND])]
         link = twin.mechanism.links[drive.link]
         alone = sum(other.link == drive.link for other in twin.mechanism.drives) == 1
-        joint = link.joint if alone and link.kind not in (BALL, FREE) else drive.name
+        joint = link.joint if alone and not link.quaternion else drive.name
         for _ in drive.inputs:
             own = next(names).name
             found.append(
@@ -190,7 +189,7 @@ def _signals(twin: MechanismTwin) -> list[tuple[str, str, list[frozenset[str]]]]
 
 
 def _measured(kind: str) -> list[frozenset[str]]:
-    """A measured effort can replace its command; a measured position is no target."""
+    """A measured effort can replace its command; a measured position cannot replace a target."""
     return [frozenset([_EFFORT])] if kind == _EFFORT else []
 
 

@@ -7,7 +7,7 @@ from typing import Any
 HINGE, SLIDE, BALL, FREE = "hinge", "slide", "ball", "free"
 #: numbers in a position and in a velocity
 SIZES = {HINGE: (1, 1), SLIDE: (1, 1), BALL: (4, 3), FREE: (7, 6)}
-#: of the degrees of freedom of a joint that has several
+#: suffixes of the names of a joint's degrees of freedom
 SUFFIXES = {
     HINGE: ("",),
     SLIDE: ("",),
@@ -19,15 +19,15 @@ SUFFIXES = {
 @dataclasses.dataclass(frozen=True)
 class Body:
     """
-    The rigid body that one link carries.
+    The rigid body of one link.
 
     :param name: of the body in the model
     :param mass: [kg]
     :param centre: of mass, in the link's frame [m]
     :param inertia: about the centre of mass, in the link's axes [kg m2]: xx, yy, zz, xy, xz, yz
-    :param origin: of the body's own frame, in the link's [m]
-    :param rotation: of the body's own frame in the link's, rows
-    :param gravcomp: mass whose weight the model compensates [kg], and its centre [m]
+    :param origin: of the body's own frame, in the link's frame [m]
+    :param rotation: of the body's own frame, relative to the link's frame, by rows
+    :param gravcomp: mass with compensated weight [kg], and its centre [m]
     """
 
     name: str
@@ -42,25 +42,25 @@ class Body:
 @dataclasses.dataclass(frozen=True)
 class Link:
     """
-    What one joint moves. Its frame has its origin at the joint's anchor, and its z axis along the
-    axis of a hinge or slide; the frame of a ball or free joint is that of the body.
+    A joint and the body that it moves. The frame has its origin at the joint's anchor, and its z
+    axis along the axis of a hinge or slide; the frame of a ball or free joint is that of the body.
 
     :param joint: name of the joint
     :param kind: of the joint: hinge, slide, ball or free
-    :param parent: index of the link that carries it; -1 for the world
-    :param rotation: of its frame in the parent's where the joint is at its reference, rows
-    :param origin: of its frame in the parent's [m]; likewise
-    :param reference: position of a hinge or slide at which that holds
+    :param parent: index of the parent link; -1 for the world
+    :param rotation: of its frame relative to the parent's, at the reference position, by rows
+    :param origin: of its frame in the parent's, at the reference position [m]
+    :param reference: reference position of a hinge or slide
     :param q: index of its first number in a position
     :param v: index of its first number in a velocity
-    :param body: what it carries, if that has a mass
-    :param stiffness: coefficients of powers of its spring's excursion
+    :param body: None if it has no mass
+    :param stiffness: coefficients of powers of the spring's deflection
     :param rest: position at which the spring is relaxed, as many numbers as a position has
     :param damping: coefficients of powers of the speed, for each degree of freedom
     :param armature: [kg m2] or [kg], for each degree of freedom
     :param friction: dry friction [N m] or [N], for each degree of freedom
     :param force_limit: of all actuators together, for a hinge or slide
-    :param limit: range that the model lets the joint move in
+    :param limit: range of motion in the model
     """
 
     joint: str
@@ -82,8 +82,23 @@ class Link:
 
     @property
     def n_q(self) -> int:
-        """:return: how many numbers it has in a position"""
+        """:return: number of its numbers in a position"""
         return SIZES[self.kind][0]
+
+    @property
+    def in_q(self) -> slice:
+        """:return: its numbers in a position"""
+        return slice(self.q, self.q + self.n_q)
+
+    @property
+    def quaternion(self) -> slice | None:
+        """:return: its quaternion in a position; None for a hinge or slide"""
+        return slice(self.q + self.n_q - 4, self.q + self.n_q) if self.n_q >= 4 else None
+
+    @property
+    def straight(self) -> slice:
+        """:return: its numbers in a position that are lengths or single angles"""
+        return slice(self.q, self.quaternion.start) if self.quaternion else self.in_q
 
     @property
     def dofs(self) -> tuple[int, ...]:
@@ -100,13 +115,13 @@ class Drive:
     :param kind: ``"affine"``, ``"pid"`` or ``"dcmotor"``
     :param link: index of the link that it drives
     :param gear: one number for a hinge or slide, three for a ball, six for a free joint
-    :param outer: whether the turning part of the gear is given in the parent's frame
-    :param inputs: what its commands are, in order: ``""`` if it has one without a name
-    :param ranges: of the commands; None where they are not limited
+    :param outer: whether the rotational part of the gear is in the parent's frame
+    :param inputs: names of its commands; ``""`` for a single one without a name
+    :param ranges: of the commands; None without limits
     :param gain: constant, and coefficients of length and speed
-    :param bias: likewise
+    :param bias: constant, and coefficients of length and speed
     :param force_limit: of the force before the gear
-    :param motor: of a DC motor, by name
+    :param motor: constants of a DC motor, by name
     """
 
     name: str
@@ -146,11 +161,11 @@ class Drive:
 @dataclasses.dataclass(frozen=True)
 class Place:
     """
-    A point that has a name: a site, or the origin of a body.
+    A named point: a site, or the origin of a body.
 
-    :param link: index of the link that carries it; -1 for the world
+    :param link: index of its link; -1 for the world
     :param position: in the link's frame [m]
-    :param rotation: of its own frame in the link's, rows
+    :param rotation: of its own frame, relative to the link's, by rows
     """
 
     name: str
@@ -162,9 +177,9 @@ class Place:
 @dataclasses.dataclass(frozen=True)
 class Shape:
     """
-    A mesh as it is drawn: a convex body.
+    The convex hull of a mesh, for drawings.
 
-    :param link: index of the link that carries it; -1 for the world
+    :param link: index of its link; -1 for the world
     :param points: its corners, in the link's frame [m]
     """
 
@@ -175,15 +190,15 @@ class Shape:
 @dataclasses.dataclass(frozen=True)
 class Mechanism:
     """
-    All data of the equation of motion of a model.
+    All data of a model's equation of motion.
 
     :param name: of the model
     :param gravity: [m/s2], in the world's frame
     :param timestep: of the model [s]
     :param integrator: ``"euler"``, ``"implicitfast"`` or ``"rk4"``
     :param implicit_damping: whether ``euler`` takes damping at the end of its step
-    :param start: position in which an episode begins
-    :param shapes: that are drawn
+    :param start: initial position of an episode
+    :param shapes: for drawings
     """
 
     name: str
@@ -224,7 +239,7 @@ class Mechanism:
 
 
 def _frozen(value: Any) -> Any:
-    """Lists, as JSON has them, as tuples."""
+    """Plain data with tuples instead of JSON's lists."""
     if isinstance(value, list | tuple):
         return tuple(_frozen(part) for part in value)
     if isinstance(value, Mapping):

@@ -1,8 +1,8 @@
 """
-The parameters of a mechanism: names, units, bounds, and what they change.
+The parameters of a mechanism: names, units, bounds, and their effect.
 
-Joints keep their names in MJCF's words, ``elbow_damping`` and ``elbow_frictionloss``; actuators
-likewise, ``elbow_servo_kp``.
+Names are those of joints and actuators with MJCF's words: ``elbow_damping``,
+``elbow_frictionloss``, ``elbow_servo_kp``.
 """
 
 import math
@@ -14,7 +14,6 @@ import numpy as np
 from sb3_hds.core import Parameter
 from sb3_hds.errors import ParameterError, did_you_mean
 from sb3_hds.twins.mujoco.mechanism import (
-    BALL,
     FREE,
     SLIDE,
     SUFFIXES,
@@ -37,14 +36,14 @@ from sb3_hds.twins.mujoco.rigid_body.dynamics import (
 Values = Mapping[str, Number]
 
 _AXES = "xyz"
-# Typical deviations: shares of what is typical at a joint, and of a parameter's own value.
+# Typical deviations, as shares of a joint's typical force and inertia, and of a parameter's value.
 _OF_FORCE, _OF_FORCE_PER_SPEED, _OF_INERTIA, _OF_ITSELF = 0.05, 0.02, 0.1, 0.1
-# Motors are stronger than what they do.
+# Typical force of a drive, as a share of its largest force.
 _OF_DRIVE = 0.1
-# A payload is a share of the mass that moves [1], at some distance from its place [m].
+# Typical payload, as a share of the moving mass, and its distance from its place [m].
 _OF_MASS, _NEAR = 0.05, 0.05
 _TILT = 0.02  # [rad]
-_SHIFT, _STRETCH = 0.02, 0.1  # of a body's centre [m], and of its shape, as a logarithm
+_SHIFT, _STRETCH = 0.02, 0.1  # of a body's centre [m], and of its shape (logarithm)
 _N_POSES = 64
 
 
@@ -52,7 +51,7 @@ def of_plant(
     mechanism: Mechanism, usual: "Typical", payload: Place | None, masses: bool
 ) -> dict[str, Parameter]:
     """
-    :param payload: where an unknown mass may be
+    :param payload: place of an unknown mass
     :param masses: whether mass, centre and inertia of each body are parameters
     :return: the parameters of the equation of motion
     """
@@ -68,7 +67,7 @@ def of_plant(
             found[f"{payload.name}_payload_{axis}"] = Parameter(0.0, _NEAR, "m")
     if masses:
         for body in moving:
-            found |= _of_body(body)
+            found |= of_body(body)
     return found
 
 
@@ -81,7 +80,7 @@ def of_drives(mechanism: Mechanism) -> dict[str, Parameter]:
 
 
 def native_effects(mechanism: Mechanism) -> dict[tuple[str, int], dict[str, str]]:
-    """:return: effects that are parameters already, by name and index of their place"""
+    """:return: effects that correspond to parameters, by name and index of their place"""
     found = {}
     for link in mechanism.links:
         if len(link.dofs) == 1:
@@ -96,29 +95,22 @@ def native_effects(mechanism: Mechanism) -> dict[tuple[str, int], dict[str, str]
 
 
 def _of_link(link: Link, inertias: np.ndarray, forces: np.ndarray) -> dict[str, Parameter]:
-    """Of a floating base, only what the model has."""
-    turns = link.kind != SLIDE
-    i, free = link.dofs[-1], link.kind == FREE
-    force = float(forces[i]) or 1.0
-    units = ("N m s/rad", "N m", "kg m2", "N m/rad") if turns else ("N s/m", "N", "kg", "N/m")
-    values = (
-        link.damping[0][0] if link.damping[0] else 0.0,
-        link.friction[0],
-        link.armature[0],
-        link.stiffness[0] if link.stiffness else 0.0,
-    )
-    scales = (
-        _OF_FORCE_PER_SPEED * force,
-        _OF_FORCE * force,
-        _OF_INERTIA * float(inertias[i]),
-        0.0,
-    )
+    """The parameters of a joint; for a floating base, only those that are not zero."""
+    i = link.dofs[-1]
+    force, inertia = float(forces[i]) or 1.0, float(inertias[i])
+    damping = link.damping[0][0] if link.damping[0] else 0.0
+    stiffness = link.stiffness[0] if link.stiffness else 0.0
+    # Value, scale, and the units of rotary and sliding joints.
+    declared = {
+        "damping": (damping, _OF_FORCE_PER_SPEED * force, "N m s/rad", "N s/m"),
+        "frictionloss": (link.friction[0], _OF_FORCE * force, "N m", "N"),
+        "armature": (link.armature[0], _OF_INERTIA * inertia, "kg m2", "kg"),
+        "stiffness": (stiffness, 0.0, "N m/rad", "N/m"),
+    }
     found = {}
-    names = ("damping", "frictionloss", "armature", "stiffness")
-    for name, value, scale, unit in zip(names, values, scales, units, strict=True):
-        wanted = scale > 0.0 and not free
-        if wanted or value:
-            scale = max(scale, _OF_ITSELF * abs(value))
+    for name, (value, scale, *units) in declared.items():
+        if value or (scale > 0.0 and link.kind != FREE):
+            scale, unit = max(scale, _OF_ITSELF * abs(value)), units[link.kind == SLIDE]
             found[f"{link.joint}_{name}"] = Parameter(value, scale, unit, min(value, 0.0))
     return found
 
@@ -148,8 +140,8 @@ def _of_drive(drive: Drive, link: Link) -> dict[str, Parameter]:
     }
 
 
-def _of_body(body: Body) -> dict[str, Parameter]:
-    """Any values make a possible body: a positive mass, and an inertia that some shape has."""
+def of_body(body: Body) -> dict[str, Parameter]:
+    """:return: mass, centre and inertia; any values are physically consistent"""
     found = {f"{body.name}_mass": Parameter(body.mass, 0.1 * body.mass, "kg", 1e-3 * body.mass)}
     for axis, value in zip(_AXES, centre_in_body(body), strict=True):
         found[f"{body.name}_com_{axis}"] = Parameter(value, _SHIFT, "m")
@@ -160,11 +152,11 @@ def _of_body(body: Body) -> dict[str, Parameter]:
     return found
 
 
-# --- what they change
+# --- their effect
 
 
 def tilts(mechanism: Mechanism) -> list[str]:
-    """:return: by which horizontal axes the world may be turned, against a mount that is askew"""
+    """:return: names of rotations of gravity about the horizontal axes, for a tilted mount"""
     size = np.abs(mechanism.gravity)
     if not size.any():
         return []
@@ -172,7 +164,7 @@ def tilts(mechanism: Mechanism) -> list[str]:
 
 
 def gravity_of(mechanism: Mechanism, p: Values) -> Vector:
-    """:return: gravity turned about the world's axes, the later one first [m/s2]"""
+    """:return: gravity rotated about the world's axes, the later one first [m/s2]"""
     found: Vector = mechanism.gravity
     for name in reversed(tilts(mechanism)):
         i = _AXES.index(name[-1])
@@ -190,12 +182,12 @@ def gravity_of(mechanism: Mechanism, p: Values) -> Vector:
 def bodies_of(
     mechanism: Mechanism, payload: Place | None, masses: bool, p: Values
 ) -> list[spatial.Body]:
-    """:return: of each link that has one, with its payload"""
+    """:return: the body of each link that has one, payload included"""
     found = []
     for i, link in enumerate(mechanism.links):
         if link.body is None:
             continue
-        own = _with_values(link.body, p) if masses else _as_given(link.body)
+        own = _with_values(link.body, p) if masses else _nominal(link.body)
         if payload is not None and payload.link == i:
             offset = [p[f"{payload.name}_payload_{axis}"] for axis in _AXES]
             place = alg.vadd(payload.position, alg.apply(payload.rotation, offset))
@@ -205,7 +197,7 @@ def bodies_of(
 
 
 def compensated(mechanism: Mechanism) -> list[spatial.Body | None]:
-    """:return: of each link that has a body, the mass whose weight something else carries"""
+    """:return: the mass with compensated weight, of each link that has a body"""
     found: list[spatial.Body | None] = []
     for link in mechanism.links:
         if link.body is not None:
@@ -215,18 +207,18 @@ def compensated(mechanism: Mechanism) -> list[spatial.Body | None]:
     return found
 
 
-def _as_given(body: Body) -> spatial.Body:
+def _nominal(body: Body) -> spatial.Body:
     return spatial.Body(body.mass, body.centre, _second_moments(body.inertia))
 
 
 def _loaded(own: spatial.Body, mass: Number, place: Vector) -> spatial.Body:
-    """A body and a point mass as one."""
-    whole = alg.add(own.mass, mass)
-    share = alg.div(mass, whole)
-    way = alg.vadd(place, alg.scale(-1.0, own.centre))
-    apart = alg.outer(alg.scale(alg.mul(own.mass, share), way), alg.scale(0.5, way))
-    centre = alg.vadd(own.centre, alg.scale(share, way))
-    return spatial.Body(whole, centre, alg.sadd(own.second_moments, apart))
+    """A body with a point mass attached."""
+    total = alg.add(own.mass, mass)
+    share = alg.div(mass, total)
+    offset = alg.vadd(place, alg.scale(-1.0, own.centre))
+    added = alg.outer(alg.scale(alg.mul(own.mass, share), offset), alg.scale(0.5, offset))
+    centre = alg.vadd(own.centre, alg.scale(share, offset))
+    return spatial.Body(total, centre, alg.sadd(own.second_moments, added))
 
 
 def _with_values(body: Body, p: Values) -> spatial.Body:
@@ -252,7 +244,7 @@ def _with_values(body: Body, p: Values) -> spatial.Body:
 
 
 def _second_moments(inertia: Symmetric) -> Symmetric:
-    """Of mass, of a body with these moments and products of inertia."""
+    """The second moments of mass of a body with these moments and products of inertia."""
     xx, yy, zz, xy, xz, yz = inertia
     half = 0.5 * (xx + yy + zz)
     return half - xx, half - yy, half - zz, -xy, -xz, -yz
@@ -260,21 +252,20 @@ def _second_moments(inertia: Symmetric) -> Symmetric:
 
 def centre_in_body(body: Body) -> tuple[float, ...]:
     """:return: the centre of mass in the body's frame [m]"""
-    way = np.array(body.rotation).T @ (np.array(body.centre) - np.array(body.origin))
-    return tuple(float(x) for x in way)
+    offset = np.array(body.rotation).T @ (np.array(body.centre) - np.array(body.origin))
+    return tuple(offset.tolist())
 
 
-# --- what is typical
+# --- typical values
 
 
 class Typical(NamedTuple):
     """
-    For each degree of freedom.
+    Typical values for each degree of freedom.
 
-    :param inertia: the smallest that a force there moves, over random positions [kg m2] or [kg]
-    :param weight: the largest force of gravity there, likewise [N m] or [N]
-    :param drive: the largest force that actuators are said to exert [N m] or [N]; 0 if they do not
-        say
+    :param inertia: smallest effective inertia over random positions [kg m2] or [kg]
+    :param weight: largest force of gravity over random positions [N m] or [N]
+    :param drive: largest force of the actuators, by their limits [N m] or [N]; 0 without limits
     """
 
     inertia: np.ndarray
@@ -283,22 +274,23 @@ class Typical(NamedTuple):
 
 
 def typical(mechanism: Mechanism) -> Typical:
+    """:return: typical inertias and forces"""
     tree, q = Tree(mechanism.links), random_positions(mechanism, _N_POSES)
     at = configuration(tree, q, bodies_of(mechanism, None, False, {}), compensated(mechanism))
-    still = np.zeros((_N_POSES, tree.n))
-    weight = np.abs(inverse_dynamics(tree, at, still, mechanism.gravity)).max(0)
+    weight = np.abs(inverse_dynamics(tree, at, np.zeros((_N_POSES, tree.n)), mechanism.gravity))
     armature = np.concatenate([link.armature for link in mechanism.links])
     matrix = np.broadcast_to(mass_matrix(tree, at), (_N_POSES, tree.n, tree.n))
     matrix = matrix + np.diag(armature)
-    felt = 1.0 / np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2)
-    drive = np.zeros(tree.n)
-    for each in mechanism.drives:
-        link = mechanism.links[each.link]
-        drive[list(link.dofs)] += np.abs(each.gear) * _largest(each, link)
-    return Typical(felt.min(0), weight, drive)
+    effective = 1.0 / np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2)
+    force = np.zeros(tree.n)
+    for drive in mechanism.drives:
+        link = mechanism.links[drive.link]
+        force[list(link.dofs)] += np.abs(drive.gear) * _largest(drive, link)
+    return Typical(effective.min(0), weight.max(0), force)
 
 
 def _largest(drive: Drive, link: Link) -> float:
+    """Largest force of a drive, by its limits and those of its joint; 0 without limits."""
     limits = [drive.force_limit, link.force_limit]
     if drive.role == "motor" and drive.ranges[0] is not None:
         low, high = drive.ranges[0]
@@ -312,23 +304,18 @@ def random_positions(mechanism: Mechanism, n: int, seed: int = 0) -> list[np.nda
     rng = np.random.default_rng(seed)
     found: list[np.ndarray] = []
     for link in mechanism.links:
-        if link.kind in (BALL, FREE):
+        if link.quaternion:
             turns = rng.normal(size=(4, n))
             found += [*rng.normal(size=(3, n))] * (link.kind == FREE)
             found += [*(turns / np.linalg.norm(turns, axis=0))]
-        elif link.kind == SLIDE:
-            low, high = link.limit or (-0.5, 0.5)
-            found.append(rng.uniform(low, high, n))
         else:
-            low, high = link.limit or (-math.pi, math.pi)
-            found.append(rng.uniform(low, high, n))
+            far = 0.5 if link.kind == SLIDE else math.pi
+            found.append(rng.uniform(*(link.limit or (-far, far)), n))
     return found
 
 
 def place_of(mechanism: Mechanism, name: str) -> Place:
-    """
-    :raises ParameterError: for a site or body that is none, or that does not move
-    """
+    """:raises ParameterError: for an unknown site or body, or one that does not move"""
     found = {place.name: place for place in mechanism.places}
     if name not in found:
         raise ParameterError(
@@ -338,7 +325,7 @@ def place_of(mechanism: Mechanism, name: str) -> Place:
     if found[name].link < 0:
         moving = [place.name for place in found.values() if place.link >= 0]
         raise ParameterError(
-            f"A payload at '{name}' of {mechanism.name} would not move, so no data tell of it. "
+            f"A payload at '{name}' of {mechanism.name} does not move, so it cannot be identified. "
             f"Choose one of: {', '.join(moving) or 'none'}."
         )
     return found[name]

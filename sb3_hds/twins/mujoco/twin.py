@@ -1,4 +1,4 @@
-"""A twin made of a model file."""
+"""A twin made from a model file."""
 
 import hashlib
 import json
@@ -29,13 +29,13 @@ from sb3_hds.core.types import (
 from sb3_hds.errors import ParameterError
 from sb3_hds.twins.mujoco.actuators import Actuation, Moving
 from sb3_hds.twins.mujoco.equation import Equation
-from sb3_hds.twins.mujoco.mechanism import BALL, FREE, SLIDE, Link, Mechanism
+from sb3_hds.twins.mujoco.mechanism import FREE, SLIDE, Mechanism
 from sb3_hds.twins.mujoco.parameters import dof_names, native_effects, of_drives, place_of
 from sb3_hds.twins.mujoco.rigid_body import algebra as alg
 from sb3_hds.twins.mujoco.rigid_body.dynamics import frames_of
 from sb3_hds.twins.mujoco.rigid_body.quaternions import normalized, turn_between, turned
 
-# How far an episode begins from where the model stands [rad] or [m].
+# Largest distance of initial positions from the model's [rad] or [m].
 _NEAR_START = 0.1
 _UNLIMITED = (-math.inf, math.inf)
 
@@ -51,24 +51,24 @@ class MechanismTwin(AnalyticTwin):
     .. math:: M(q)\,\dot v + c(q, v) + \tau_\text{damping} + \tau_\text{dry} + \tau_\text{spring}
               = \tau(q, v, u)
 
-    Equals MuJoCo's ``Euler``, ``implicitfast`` and ``RK4`` while nothing touches, no joint is at
-    its limit and nothing rubs. Dry friction is :math:`\tau_c \tanh(v / 0.01)`, taken at the end of
-    the step as damping is (by ``RK4`` at its beginning, smoothed over what a step can stop): under
-    a load a joint creeps where MuJoCo's sticks. Orientations are quaternions in positions, and
+    Equals MuJoCo's ``Euler``, ``implicitfast`` and ``RK4`` without contacts, active joint limits
+    and dry friction. Dry friction is :math:`\tau_c \tanh(v / 0.01)`, taken like damping at the end
+    of the step (by ``RK4`` at its beginning, smoothed over the speed that a step can stop): under a
+    load a joint creeps where MuJoCo's sticks. Orientations are quaternions in positions, and
     rotation vectors in tangents; the velocity of a ball or free joint is MuJoCo's: its rotation in
     the body's frame.
 
     Made by ``twins.from_mujoco``.
 
-    :param mechanism: the numbers of the model, or their plain data
-    :param observe: ``"qv"`` for positions and velocities, ``"q"`` for positions only, where
-        :meth:`infer` says that velocities are zero
+    :param mechanism: the data of the model, also as plain data
+    :param observe: ``"qv"`` for positions and velocities, ``"q"`` for positions only: then
+        :meth:`infer` sets velocities to zero
     :param payload: name of the site or body that may carry an unknown mass
     :param masses: whether mass, centre and inertia of each body are parameters
     :param dt: control interval [s]; default: the model's time step
-    :param substeps: default: as many as keep to the model's time step
+    :param substeps: default: the fewest with at most the model's time step
     :param reward: of a task; None: zero
-    :param terminated: when a task ends; None: never
+    :param terminated: termination of a task; None: never
     :param settings: values of parameters
     """
 
@@ -102,7 +102,7 @@ class MechanismTwin(AnalyticTwin):
         self.actuation = Actuation(mechanism)
         self.parameters = self.equation.parameters | of_drives(mechanism)
         self.native_effects = native_effects(mechanism)
-        # The damping gain of a drive is known; viscous friction would be aliased with it.
+        # The damping gain of a drive counts as known, because viscous friction is aliased with it.
         servos = ("position", "velocity")
         self.known_parameters = frozenset(
             f"{drive.name}_kv" for drive in mechanism.drives if drive.role in servos
@@ -112,7 +112,8 @@ class MechanismTwin(AnalyticTwin):
             Joint(*joint, *limit) for joint, limit in zip(dof_names(mechanism), limits, strict=True)
         )
         self.actuators = tuple(_actuators(mechanism))
-        self.channels = (*_positions(mechanism), *(_velocities(mechanism) * (observe == "qv")))
+        velocities = [Channel(f"{n}_velocity", f"{unit}/s") for n, unit in dof_names(mechanism)]
+        self.channels = (*_positions(mechanism), *(velocities if observe == "qv" else ()))
         self._reward, self._terminated = reward, terminated
         self.integrator = rk4 if mechanism.integrator == "rk4" else semi_implicit_euler
         self._digest = hashlib.sha1(json.dumps(mechanism.to_spec()).encode()).hexdigest()
@@ -139,7 +140,7 @@ class MechanismTwin(AnalyticTwin):
         return self.equation.acceleration(q, v, force, coupling, params, step)
 
     def _coupling(self, state: State, command: Action, params: Params) -> MassMatrix:
-        """The step times slopes by velocities, of what the integrator takes at its end."""
+        """The step times derivatives by velocities, for forces taken at the end of the step."""
         mechanism, h = self.mechanism, self.dt / self.substeps
         implicit = mechanism.integrator == "implicitfast"
         slope = jnp.zeros_like(state.v)
@@ -152,7 +153,7 @@ class MechanismTwin(AnalyticTwin):
 
     @property
     def _explicit_step(self) -> float:
-        """The step [s] where damping is taken at its beginning, 0 where it is at its end."""
+        """The step [s] if damping is taken at its beginning, 0 if at its end."""
         euler = self.mechanism.integrator == "euler" and self.mechanism.implicit_damping
         implicit = euler or self.mechanism.integrator == "implicitfast"
         return 0.0 if implicit else self.dt / self.substeps
@@ -161,32 +162,31 @@ class MechanismTwin(AnalyticTwin):
         return Moving(state.q, self.coordinates(state.q), state.v)
 
     def typical_forces(self) -> tuple[float, ...]:
-        """Gravity's at random positions, and the most that actuators are said to exert."""
+        """Largest gravity at random positions, plus the limits of the actuators."""
         usual = self.equation.typical
         return tuple((usual.weight + usual.drive).tolist())
 
     # --- positions
 
     def coordinates(self, q: Position) -> Coordinates:
-        """Where a joint has a quaternion: the rotation vector from its reference."""
+        """Quaternions become rotation vectors from the reference."""
         return self._between(q, self._reference(q)) if self._curved else q
 
-    def displace(self, q: Position, way: Velocity) -> Position:
+    def displace(self, q: Position, displacement: Velocity) -> Position:
+        if not self._curved:
+            return q + displacement
         parts = []
         for link in self.mechanism.links:
-            here, ahead = _q(link, q), way[link.v : link.v + len(link.dofs)]
-            if link.kind == FREE:
-                parts += [here[:3] + ahead[:3], turned(here[3:], ahead[3:])]
-            elif link.kind == BALL:
-                parts.append(turned(here, ahead))
-            else:
-                parts.append(here + ahead)
-        return jnp.concatenate(parts) if self._curved else q + way
+            here, ahead = q[link.straight], displacement[link.v : link.v + len(link.dofs)]
+            parts.append(here + ahead[: len(here)])
+            if link.quaternion:
+                parts.append(turned(q[link.quaternion], ahead[-3:]))
+        return jnp.concatenate(parts)
 
     def difference(self, state: State, reference: State) -> Tangent:
-        rest = ravel_pytree(state.memory)[0] - ravel_pytree(reference.memory)[0]
-        way = self._between(state.q, reference.q)
-        return jnp.concatenate([way, state.v - reference.v, rest])
+        memory = ravel_pytree(state.memory)[0] - ravel_pytree(reference.memory)[0]
+        displacement = self._between(state.q, reference.q)
+        return jnp.concatenate([displacement, state.v - reference.v, memory])
 
     def retract(self, state: State, tangent: Tangent) -> State:
         n = self.mechanism.n_v
@@ -203,39 +203,34 @@ class MechanismTwin(AnalyticTwin):
             return q - reference
         parts = []
         for link in self.mechanism.links:
-            here, there = _q(link, q), _q(link, reference)
-            if link.kind == FREE:
-                turn = turn_between(here[3:], there[3:])
-                parts += [here[:3] - there[:3], turn]
-            elif link.kind == BALL:
-                parts.append(turn_between(here, there))
-            else:
-                parts.append(here - there)
+            parts.append(q[link.straight] - reference[link.straight])
+            if link.quaternion:
+                parts.append(turn_between(q[link.quaternion], reference[link.quaternion]))
         return jnp.concatenate(parts)
 
     def _reference(self, q: Position) -> Position:
-        """Zero of every joint, and no rotation."""
+        """All joints at zero, with unit quaternions."""
         zero = np.zeros(self.mechanism.n_q)
         for link in self.mechanism.links:
-            if link.kind in (BALL, FREE):
-                zero[link.q + (3 if link.kind == FREE else 0)] = 1.0
+            if link.quaternion:
+                zero[link.quaternion.start] = 1.0
         return jnp.asarray(zero, q.dtype)
 
     # --- measurements
 
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
-        """At rest near where the model stands: its first keyframe, or its reference position."""
+        """At rest, near the model's first keyframe or its reference position."""
         start, n = jnp.array(self.mechanism.start), self.mechanism.n_v
-        way = jax.random.uniform(key, (n,), minval=-_NEAR_START, maxval=_NEAR_START)
-        return State(self.displace(start, way.astype(start.dtype)), jnp.zeros(n, start.dtype), {})
+        offset = jax.random.uniform(key, (n,), minval=-_NEAR_START, maxval=_NEAR_START)
+        q = self.displace(start, offset.astype(start.dtype))
+        return State(q, jnp.zeros(n, start.dtype), {})
 
     def infer(self, obs: Obs, params: Params) -> State:
         n = self.mechanism.n_q
         q = obs[:n]
-        for link in self.mechanism.links if self._curved else ():
-            if link.kind in (BALL, FREE):
-                at = link.q + (3 if link.kind == FREE else 0)
-                q = q.at[at : at + 4].set(normalized(q[at : at + 4]))
+        for link in self.mechanism.links:
+            if at := link.quaternion:
+                q = q.at[at].set(normalized(q[at]))
         v = obs[n:] if self.observed == "qv" else jnp.zeros(self.mechanism.n_v, obs.dtype)
         return State(q, v, {})
 
@@ -255,7 +250,7 @@ class MechanismTwin(AnalyticTwin):
     def skeleton(self, state: State) -> Float[Array, "capsules 2 3"]:
         """
         :return: both ends of a capsule for each link: from its parent's frame to its own, and from
-            the frame of a last link to its centre of mass, or the farthest site or body there [m]
+            the frame of a leaf to the farthest of its centre of mass, sites and bodies [m]
         """
         links, zero = self.mechanism.links, jnp.zeros_like(state.v[0])
         frames = frames_of(links, list(state.q))
@@ -278,8 +273,8 @@ class MechanismTwin(AnalyticTwin):
 
     def meshes(self, state: State) -> Float[Array, "shapes corners 3"]:
         """
-        :return: corners of the convex bodies that its model's meshes are drawn as [m]; those of a
-            body that has fewer than others come more than once
+        :return: corners of the convex hulls of the model's meshes [m]; those of smaller hulls are
+            repeated
         """
         shapes, frames = self.mechanism.shapes, frames_of(self.mechanism.links, list(state.q))
         most = max((len(shape.points) for shape in shapes), default=0)
@@ -294,7 +289,7 @@ class MechanismTwin(AnalyticTwin):
         return jnp.concatenate(found)
 
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
-        """The mechanism seen along y: from the world through all joints to each last body."""
+        """The mechanism seen along y: from the world through all joints to each leaf."""
         links, zero = self.mechanism.links, jnp.zeros_like(state.v[0])
         frames = frames_of(links, list(state.q))
         seen = lambda place: jnp.stack([zero + place[0], zero + place[2]])  # noqa: E731
@@ -315,7 +310,7 @@ class MechanismTwin(AnalyticTwin):
     # --- plain data
 
     def to_spec(self) -> dict[str, Any]:
-        """Without reward and termination, which are programs."""
+        """Without reward and termination, which are functions."""
         options = {
             "mechanism": self.mechanism.to_spec(),
             "observe": self.observed,
@@ -329,10 +324,6 @@ class MechanismTwin(AnalyticTwin):
     def structure(self) -> tuple[Any, ...]:
         own = (self._digest, self.observed, self.payload, self.masses)
         return (*super().structure(), *own, self._reward, self._terminated)
-
-
-def _q(link: Link, q: Position) -> Any:
-    return q[link.q : link.q + {FREE: 7, BALL: 4}.get(link.kind, 1)]
 
 
 def _actuators(mechanism: Mechanism) -> list[Actuator]:
@@ -362,12 +353,8 @@ def _positions(mechanism: Mechanism) -> list[Channel]:
     for link in mechanism.links:
         if link.kind == FREE:
             found += [Channel(f"{link.joint}_{axis}", "m") for axis in "xyz"]
-        if link.kind in (BALL, FREE):
+        if link.quaternion:
             found += [Channel(f"{link.joint}_q{part}", "1") for part in "wxyz"]
         else:
             found.append(Channel(f"{link.joint}_position", "m" if link.kind == SLIDE else "rad"))
     return found
-
-
-def _velocities(mechanism: Mechanism) -> list[Channel]:
-    return [Channel(f"{name}_velocity", f"{unit}/s") for name, unit in dof_names(mechanism)]

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 
 from sb3_hds.core import Actuator, Joint, Parameter, State
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
-from sb3_hds.errors import ParameterError
-from sb3_hds.twins.rigs.rig import TILT, Rig, check_length
+from sb3_hds.twins.rigs.rig import TILT, Rig
 
 _SHOULDER, _ELBOW = (Actuator(name, "N m", -math.inf, math.inf) for name in ("motor1", "motor2"))
 _DRIVEN = {"both": (_SHOULDER, _ELBOW), "first": (_SHOULDER,), "second": (_ELBOW,)}
@@ -16,8 +15,8 @@ _DRIVEN = {"both": (_SHOULDER, _ELBOW), "first": (_SHOULDER,), "second": (_ELBOW
 
 class DoublePendulum(Rig):
     r"""
-    A double pendulum whose links hang at zero, driven at its first joint (pendubot), its second
-    (acrobot), or both. The second angle counts from the first link.
+    A double pendulum, driven at its first joint (pendubot), its second (acrobot), or both. The
+    links hang at zero, and the second angle is relative to the first link.
 
     .. math::
         M = \begin{pmatrix}
@@ -35,13 +34,13 @@ class DoublePendulum(Rig):
     and Automation Magazine, 2023, equations of motion.
 
     :param driven: option; ``"both"``, ``"first"`` or ``"second"``
-    :param tip: option; how far from the second joint a payload hangs [m]
+    :param tip: option; distance of the payload from the second joint [m]
     """
 
     name = "DoublePendulum"
     options = {"driven": "both", "tip": 0.3}
+    choices = {"driven": _DRIVEN}
     driven: str
-    tip: float
     joints = (Joint("joint1", "rad"), Joint("joint2", "rad"))
     actuators = (_SHOULDER, _ELBOW)
     parameters = {
@@ -67,19 +66,13 @@ class DoublePendulum(Rig):
 
     def __init__(self, **settings: object) -> None:
         super().__init__(**settings)  # type: ignore[arg-type]
-        if self.driven not in _DRIVEN:
-            raise ParameterError(
-                f"driven must be one of {', '.join(map(repr, _DRIVEN))}, got {self.driven!r}."
-            )
-        check_length(self.name, "tip", self.tip)
         self.actuators = _DRIVEN[self.driven]
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:
         if self.driven == "both":
             return action
         zero = jnp.zeros_like(action[0])
-        pair = (action[0], zero) if self.driven == "first" else (zero, action[0])
-        return jnp.stack(pair)
+        return jnp.stack((action[0], zero) if self.driven == "first" else (zero, action[0]))
 
     def mass_matrix(self, q: Position, params: Params) -> MassMatrix:
         mass, moment = self._second_link(params)
@@ -98,15 +91,9 @@ class DoublePendulum(Rig):
         inner = jnp.sin(angle)
         upper = params["mass1"] * params["com1"] + mass * params["length1"]
         outer = g * moment * jnp.sin(angle + q[1])
-        return jnp.stack(
-            [
-                -bend * (2.0 * v[0] + v[1]) * v[1]
-                + g * upper * inner
-                + outer
-                + params["damping1"] * v[0],
-                bend * v[0] ** 2 + outer + params["damping2"] * v[1],
-            ]
-        )
+        first = -bend * (2.0 * v[0] + v[1]) * v[1] + g * upper * inner + outer
+        second = bend * v[0] ** 2 + outer
+        return jnp.stack([first + params["damping1"] * v[0], second + params["damping2"] * v[1]])
 
     def _second_link(self, params: Params) -> tuple[Any, Any]:
         """Mass [kg] and first moment about the second joint [kg m], payload included."""

@@ -11,12 +11,13 @@ from sb3_hds.twins.rigs.rig import Rig
 
 class Duffing(Rig):
     r"""
-    A mass on a spring that hardens, pushed by a force.
+    A mass on a hardening spring, pushed by a force.
 
     .. math:: m\,\dot v + b\,v + k\,q + k_3\,q^3 = u
 
-    Source: Kovacic and Brennan, *The Duffing Equation*, Wiley 2011, section 1.1. A negative
-    :math:`k` with a positive :math:`k_3` has two resting places.
+    A negative :math:`k` with a positive :math:`k_3` gives two stable equilibria.
+
+    Source: Kovacic and Brennan, *The Duffing Equation*, Wiley 2011, section 1.1.
     """
 
     name = "Duffing"

@@ -1,4 +1,4 @@
-"""A pendulum that swings by itself."""
+"""A pendulum that swings freely."""
 
 import math
 
@@ -6,10 +6,8 @@ import jax.numpy as jnp
 
 from sb3_hds.core import Actuator, Joint, Parameter, State
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
-from sb3_hds.errors import ParameterError
-from sb3_hds.twins.rigs.rig import TILT, Rig, check_length
+from sb3_hds.twins.rigs.rig import TILT, Rig
 
-_ZEROS = ("down", "up")
 _MOTOR = Actuator("motor", "N m", -math.inf, math.inf)
 
 
@@ -23,20 +21,20 @@ class FreePendulum(Rig):
 
     with the distance :math:`a` from the pivot to the centre of mass, the moment of inertia
     :math:`I` about that, and a payload :math:`m_p` at a distance :math:`l` from the pivot.
-    :math:`\theta_0` is 0 where the angle counts from hanging, and :math:`\pi` where it counts from
-    upright; by :math:`\gamma`, gravity is tilted, as on a table that is not level. Without a motor,
-    only their quotients show in the motion.
+    :math:`\theta_0` is 0 if the angle is zero when hanging, and :math:`\pi` if it is zero upright.
+    Gravity is tilted by :math:`\gamma`, as on a table that is not level. Without a motor, the
+    motion determines only ratios of the parameters.
 
-    :param zero: option; ``"down"`` or ``"up"``: where the angle is zero
+    :param zero: option; ``"down"`` or ``"up"``: the position at which the angle is zero
     :param driven: option; whether a motor at the pivot takes a torque
-    :param tip: option; how far from the pivot a payload hangs [m]
+    :param tip: option; distance of the payload from the pivot [m]
     """
 
     name = "FreePendulum"
     options = {"zero": "down", "driven": False, "tip": 0.3}
+    choices = {"zero": ("down", "up"), "driven": (True, False)}
     zero: str
     driven: bool
-    tip: float
     joints = (Joint("hinge", "rad"),)
     actuators = ()
     parameters = {
@@ -52,11 +50,6 @@ class FreePendulum(Rig):
 
     def __init__(self, **settings: object) -> None:
         super().__init__(**settings)  # type: ignore[arg-type]
-        if self.zero not in _ZEROS:
-            raise ParameterError(f"zero must be 'down' or 'up', got {self.zero!r}.")
-        check_length(self.name, "tip", self.tip)
-        if self.driven not in (True, False):
-            raise ParameterError(f"driven must be True or False, got {self.driven!r}.")
         self.actuators = (_MOTOR,) if self.driven else ()
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:

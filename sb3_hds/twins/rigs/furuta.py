@@ -1,4 +1,4 @@
-"""Furuta's pendulum: an arm that turns in the plane and carries a pendulum."""
+"""Furuta's pendulum: a pendulum on an arm that rotates in the horizontal plane."""
 
 import math
 from typing import Any
@@ -7,13 +7,13 @@ import jax.numpy as jnp
 
 from sb3_hds.core import Actuator, Joint, Parameter, State
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Scalar, Velocity
-from sb3_hds.twins.rigs.rig import TILT, Rig, check_length
+from sb3_hds.twins.rigs.rig import TILT, Rig
 
 
 class Furuta(Rig):
     r"""
-    A motor turns a horizontal arm; at its end a pendulum swings across it. Angles are zero where
-    the pendulum hangs.
+    A motor rotates a horizontal arm, and a pendulum at its end swings across it. The pendulum hangs
+    at zero.
 
     .. math::
         \big(J_1 + m l_1^2 + J \sin^2\alpha\big)\,\ddot\theta + m l_1 a \cos\alpha\,\ddot\alpha
@@ -26,19 +26,18 @@ class Furuta(Rig):
     :math:`l` along the pendulum adds to its mass, to :math:`m a` by :math:`m_p l` and to :math:`J`
     by :math:`m_p l^2`.
 
-    Where the axis of the arm does not stand upright, gravity points along :math:`(\sin\gamma_x,
+    If the axis of the arm is not vertical, gravity points along :math:`(\sin\gamma_x,
     \cos\gamma_x \sin\gamma_y, -\cos\gamma_x \cos\gamma_y)` in the frame of the base, in which
-    the arm points along x at zero. The arm itself is taken to be balanced about its axis.
+    the arm points along x at zero. The arm itself is assumed balanced about its axis.
 
     Source: Cazzolato and Prime, *On the dynamics of the Furuta pendulum*, Journal of Control
     Science and Engineering, 2011, for a slender pendulum.
 
-    :param tip: option; how far from its hinge a payload hangs on the pendulum [m]
+    :param tip: option; distance of the payload from the hinge of the pendulum [m]
     """
 
     name = "Furuta"
     options = {"tip": 0.13}
-    tip: float
     joints = (Joint("arm", "rad"), Joint("pendulum", "rad"))
     actuators = (Actuator("motor", "N m", -math.inf, math.inf),)
     parameters = {
@@ -59,10 +58,6 @@ class Furuta(Rig):
         ("viscous_friction", 1): {"b": "pendulum_damping"},
     }
 
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings)
-        check_length(self.name, "tip", self.tip)
-
     def actuate(self, state: State, action: Action, params: Params) -> Force:
         return jnp.stack([action[0], jnp.zeros_like(action[0])])
 
@@ -79,18 +74,10 @@ class Furuta(Rig):
         turn = hinge * jnp.sin(2.0 * q[1])
         sine, cosine = jnp.sin(q[1]), jnp.cos(q[1])
         along, across, down = self._gravity(q[0], params)
-        return jnp.stack(
-            [
-                turn * v[0] * v[1]
-                - moment * arm * sine * v[1] ** 2
-                + params["arm_damping"] * v[0]
-                - mass * arm * across
-                + moment * sine * along,
-                -0.5 * turn * v[0] ** 2
-                + params["pendulum_damping"] * v[1]
-                + moment * (sine * down - cosine * across),
-            ]
-        )
+        first = turn * v[0] * v[1] - moment * arm * sine * v[1] ** 2 + params["arm_damping"] * v[0]
+        first = first - mass * arm * across + moment * sine * along
+        second = -0.5 * turn * v[0] ** 2 + params["pendulum_damping"] * v[1]
+        return jnp.stack([first, second + moment * (sine * down - cosine * across)])
 
     def _pendulum(self, params: Params) -> tuple[Any, Any, Any]:
         """Mass [kg], first moment [kg m] and moment of inertia [kg m2] about the hinge."""
@@ -100,7 +87,7 @@ class Furuta(Rig):
 
     @staticmethod
     def _gravity(arm: Scalar, params: Params) -> tuple[Scalar, Scalar, Scalar]:
-        """Along the arm, across it (the way it turns), and down [m/s2]."""
+        """Gravity along the arm, across it (in the direction of rotation), and down [m/s2]."""
         g, sine, cosine = params["gravity"], jnp.sin(params["tilt_x"]), jnp.cos(params["tilt_x"])
         x, y = g * sine, g * cosine * jnp.sin(params["tilt_y"])
         down = g * cosine * jnp.cos(params["tilt_y"])

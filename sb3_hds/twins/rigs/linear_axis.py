@@ -15,8 +15,8 @@ class LinearAxis(Rig):
 
     .. math:: m\,\dot v = u - b\,v
 
-    The command is the force of the drive; its limits are those of the amplifier, so none are set
-    here. Dry friction, an offset or a lag are effects: attach what is known of them.
+    The command is the force of the drive, without limits: they depend on the amplifier. Attach dry
+    friction, an offset or a lag as effects.
     """
 
     name = "LinearAxis"

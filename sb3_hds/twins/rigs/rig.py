@@ -1,4 +1,4 @@
-"""Machines on a bench: measured joint by joint, without a task."""
+"""Machines on a test bench: joints are measured directly, and there is no task."""
 
 import math
 from typing import Any
@@ -10,35 +10,40 @@ from jaxtyping import PRNGKeyArray
 from sb3_hds.core import AnalyticTwin, Channel, Obs, Parameter, Params, State, rk4
 from sb3_hds.errors import ParameterError
 
-#: by how much gravity is turned in the plane of a pendulum, the way the angle counts
+#: rotation of gravity in the plane of a pendulum, in the direction of its angle
 TILT = Parameter(null=0.0, scale=0.02, unit="rad", lower=-0.5 * math.pi, upper=0.5 * math.pi)
 
 
 class Rig(AnalyticTwin):
     """
-    A machine whose joints are measured directly, and that nobody gives a reward.
+    Abstract: a machine whose joints are measured directly, without a reward.
 
-    Runge-Kutta steps follow continuous time. Recordings begin anywhere, so :meth:`initial` only
-    serves to try the rig out: at rest, within 0.1 [rad or m] of where positions are zero. Where
-    velocities are not observed, :meth:`infer` says zero.
+    Runge-Kutta steps approximate continuous time. Recordings begin anywhere, so :meth:`initial` is
+    only for trials: at rest, within 0.1 rad or m of zero. If velocities are not observed,
+    :meth:`infer` sets them to zero.
 
-    :param observe: ``"q"`` if encoders report positions only, ``"qv"`` for velocities too
-    :param settings: as of every twin
-    :raises ParameterError: for another ``observe``
+    :param observe: ``"q"`` for positions only, as of encoders, ``"qv"`` for velocities too
+    :param settings: as for every twin
+    :raises ParameterError: for another ``observe``, or a ``tip`` that is not a length
     """
 
     dt = 0.01
     substeps = 2
     integrator = staticmethod(rk4)
-    #: what ``observe`` may be
+    #: valid values of ``observe``
     observable: tuple[str, ...] = ("q", "qv")
     observed: str
+    #: option of pendulums: distance of a payload from the last joint [m]
+    tip: float
 
     def __init__(self, *, observe: str = "qv", **settings: Any) -> None:
         super().__init__(**settings)
         if observe not in self.observable:
-            choices = " or ".join(map(repr, self.observable))
-            raise ParameterError(f"{self.name} can observe {choices}, got {observe!r}.")
+            allowed = " or ".join(map(repr, self.observable))
+            raise ParameterError(f"{self.name} can observe {allowed}, got {observe!r}.")
+        tip = getattr(self, "tip", 1.0)
+        if not (isinstance(tip, int | float) and 0.0 < tip < math.inf):
+            raise ParameterError(f"tip of {self.name} must be a length above 0 m, got {tip!r}.")
         self.observed = observe
         self.channels = self.channels_of(observe)
 
@@ -68,9 +73,3 @@ class Rig(AnalyticTwin):
 
     def structure(self) -> tuple[Any, ...]:
         return (*super().structure(), self.observed)
-
-
-def check_length(twin: str, option: str, value: Any) -> None:
-    """:raises ParameterError: for an option that is no length"""
-    if not (isinstance(value, int | float) and 0.0 < value < math.inf):
-        raise ParameterError(f"{option} of {twin} must be a length above 0 m, got {value!r}.")

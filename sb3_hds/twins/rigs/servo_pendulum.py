@@ -6,7 +6,6 @@ import jax.numpy as jnp
 
 from sb3_hds.core import Actuator, Joint, Parameter, State
 from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
-from sb3_hds.errors import ParameterError
 from sb3_hds.twins.rigs.rig import TILT, Rig
 
 _GOAL = Actuator("goal", "rad", -math.pi, math.pi)
@@ -29,19 +28,20 @@ class ServoPendulum(Rig):
         (m l^2 + I)\,\dot v &= \frac{k_t}{R}\,V d - \frac{k_t^2}{R}\,v - b\,v
         - m g l \sin(q + \gamma)
 
-    The angle is zero where the arm hangs if the servo stands upright; by :math:`\gamma` it is
-    tilted. The command :math:`u` is the goal position. With the motor off (``enable`` at 0) the
-    winding is open: neither torque nor its damping. A payload at the tip is a larger mass.
+    The arm hangs at zero if the servo is upright; :math:`\gamma` is its tilt. The command
+    :math:`u` is the goal position. With the motor off (``enable`` at 0) the winding is open:
+    neither torque nor electric damping. A payload at the tip is a larger mass.
 
     Source: Duclusaud et al., arXiv 2410.08650, 2024, section III; a DC motor without inductance.
 
-    :param commands: option; ``"goal"``, ``"goal, enable"`` or ``"goal, enable, gain"``: the latter
-        for logs over which the firmware's gain differs, which then replaces the parameter ``kp``
+    :param commands: option; ``"goal"``, ``"goal, enable"`` or ``"goal, enable, gain"``; the last
+        one for logs with different gains of the firmware, which replace the parameter ``kp``
     """
 
     name = "ServoPendulum"
     dt = 0.005
     options = {"commands": "goal"}
+    choices = {"commands": _COMMANDS}
     commands: str
     joints = (Joint("servo", "rad"),)
     actuators = (_GOAL,)
@@ -64,10 +64,6 @@ class ServoPendulum(Rig):
         if settings.get("commands") == _LOGGED_GAIN:
             self.parameters = {n: p for n, p in self.parameters.items() if n != "kp"}
         super().__init__(**settings)  # type: ignore[arg-type]
-        if self.commands not in _COMMANDS:
-            raise ParameterError(
-                f"commands must be one of {', '.join(map(repr, _COMMANDS))}, got {self.commands!r}."
-            )
         self.actuators = _COMMANDS[self.commands]
 
     def actuate(self, state: State, action: Action, params: Params) -> Force:
@@ -75,10 +71,8 @@ class ServoPendulum(Rig):
         gain = action[2] if n > 2 else params["kp"]
         on = action[1] if n > 1 else 1.0
         duty = jnp.clip(gain * params["duty_per_error"] * (action[0] - state.q), -1.0, 1.0)
-        current = (params["voltage"] * duty - params["torque_constant"] * state.v) / params[
-            "resistance"
-        ]
-        return on * params["torque_constant"] * current
+        voltage = params["voltage"] * duty - params["torque_constant"] * state.v
+        return on * params["torque_constant"] * (voltage / params["resistance"])
 
     def mass_matrix(self, q: Position, params: Params) -> MassMatrix:
         inertia = params["mass"] * params["length"] ** 2 + params["armature"]

@@ -1,1 +1,1 @@
-"""Model files of robots: read, refused where a twin would be wrong, and written back corrected."""
+"""Model files of robots: loading, unsupported features, and corrected copies."""

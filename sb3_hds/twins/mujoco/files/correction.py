@@ -7,27 +7,28 @@ import numpy as np
 from sb3_hds.core import ExtendedTwin, Twin
 from sb3_hds.core.extended import with_native
 from sb3_hds.core.twin import layers_of
-from sb3_hds.twins.mujoco.mechanism import Mechanism
+from sb3_hds.twins.mujoco.mechanism import Body, Mechanism
 from sb3_hds.twins.mujoco.parameters import bodies_of
+from sb3_hds.twins.mujoco.rigid_body import algebra as alg
 from sb3_hds.twins.mujoco.rigid_body import spatial
 from sb3_hds.twins.mujoco.twin import MechanismTwin
 
 OF_JOINTS = ("damping", "frictionloss", "armature", "stiffness")
 DIGITS = 9
-# Smaller changes of a body, relative to it, are rounding.
+# Relative changes of a body below this are rounding errors.
 _SAME = 1e-12
 
 
 @dataclasses.dataclass
 class Correction:
     """
-    The changes that a file has to carry, and the record of what was written.
+    The differences to write into a model file, and a record of what was written.
 
     :param plant: the twin of the file, without effects
-    :param values: of the plant, with what effects add to them
-    :param effects: others: name, index and place of each, with its values
-    :param changed: what was written, a line each
-    :param left_out: what the format cannot express, a line each
+    :param values: parameters of the plant, changed by native effects
+    :param effects: the other effects: name, index of the place, key and values of each
+    :param changed: written changes, a line each
+    :param left_out: changes that the format cannot express, a line each
     """
 
     plant: MechanismTwin
@@ -62,7 +63,7 @@ class Correction:
         return self.plant.mechanism
 
     def difference(self, name: str) -> float:
-        """:return: from the value that the file has"""
+        """:return: the change of a parameter relative to the file"""
         if name not in self.values:
             return 0.0
         return self.values[name] - self.plant.parameters[name].null
@@ -74,6 +75,10 @@ class Correction:
 
     def record_left_out(self, name: str) -> None:
         self.left_out.append(f"{name}: {self.values[name]:.6g} {self.plant.parameters[name].unit}")
+
+    def record_effect(self, key: str, own: dict[str, float], *, written: bool) -> None:
+        lines = [f"{key}.{name}: {value:.6g}" for name, value in own.items()]
+        (self.changed if written else self.left_out).extend(lines)
 
 
 def changed_bodies(correction: Correction) -> dict[int, spatial.Body]:
@@ -87,6 +92,18 @@ def changed_bodies(correction: Correction) -> dict[int, spatial.Body]:
         strict=True,
     )
     return {i: new for i, old, new in pairs if not np.allclose(_flat(old), _flat(new), _SAME, 0.0)}
+
+
+def in_body_frame(body: Body, new: spatial.Body) -> tuple[float, np.ndarray, np.ndarray]:
+    """
+    :param body: as the file has it
+    :param new: the same body, corrected, in the frame of its link
+    :return: mass, centre of mass and second moments about it, in the frame of the body
+    """
+    rotation, origin = np.array(body.rotation), np.array(body.origin)
+    centre = rotation.T @ (np.array(new.centre, float) - origin)
+    second = rotation.T @ np.array(alg.full(new.second_moments), float) @ rotation
+    return float(new.mass), centre, second
 
 
 def _flat(body: spatial.Body) -> np.ndarray:

@@ -13,10 +13,10 @@ from sb3_hds.twins.mujoco.library import mujoco
 class Loaded(NamedTuple):
     """
     :param model: an ``MjModel``
-    :param dt: control interval, where an environment has one [s]
-    :param urdf: whether it comes from a URDF, which names neither drives nor an integrator
+    :param dt: control interval of an environment [s]
+    :param urdf: whether it comes from a URDF, which has neither drives nor an integrator
     :param mimics: joints of a URDF that follow another, which older versions of MuJoCo leave free
-    :param drawn: what is seen of its bodies; None for nothing
+    :param drawn: a compiled model with the visual meshes; None without any
     """
 
     model: Any
@@ -44,8 +44,8 @@ def load(source: Any) -> Loaded:
     if isinstance(model, mj.MjModel):
         return Loaded(model, float(source.unwrapped.dt), drawn=model)
     raise ModelFileError(
-        "A model is the path of an MJCF or URDF file, an MjSpec, an MjModel, or an environment of "
-        f"Gymnasium with MuJoCo inside, got {type(source).__name__}."
+        "A model is the path of an MJCF or URDF file, an MjSpec, an MjModel, or a MuJoCo "
+        f"environment of Gymnasium, got {type(source).__name__}."
     )
 
 
@@ -81,7 +81,7 @@ def spec_of(source: Any) -> tuple[Any, Any, bool]:
 def _parser_of(
     source: str | os.PathLike[str],
 ) -> tuple[str, bool, Callable[[], Any], str]:
-    """Its text, whether that is a URDF, what makes an ``MjSpec`` of it, and how to call it."""
+    """Text, whether it is a URDF, a function that returns its ``MjSpec``, and a name for errors."""
     text = str(source).lstrip()
     inline = text.startswith("<")
     where = "this text" if inline else f"'{source}'"
@@ -99,7 +99,7 @@ def _parser_of(
         read = mj.MjSpec.from_string if inline else mj.MjSpec.from_file
         spec = read(text if inline else str(source))
         if urdf:
-            # Tools and flanges keep their names: a payload may be there.
+            # Keep the names of tools and flanges as places for a payload.
             spec.compiler.fusestatic = False
         return spec
 
@@ -107,40 +107,30 @@ def _parser_of(
 
 
 def _compiled(parsed: Callable[[], Any], where: str) -> tuple[Any, Any]:
-    """Without what only shows or touches, if files for that are missing: inertials suffice."""
+    """The model and its spec; without meshes and textures if their files are missing."""
     mj = mujoco()
     try:
         spec = parsed()
         return spec.compile(), spec
     except ValueError as error:
-        if not _is_about_files(error):
+        about_files = ("file", "mesh", "texture", "resource")
+        if not any(word in str(error).lower() for word in about_files):
             raise ModelFileError(f"MuJoCo refuses {where}: {_first_line(error)}.") from None
     spec = parsed()
     shapes = [getattr(mj.mjtGeom, name) for name in ("mjGEOM_MESH", "mjGEOM_HFIELD", "mjGEOM_SDF")]
     shaped = [geom for geom in spec.geoms if geom.type in shapes]
     bare = {geom.parent.name for geom in shaped if not geom.parent.explicitinertial}
-    for part in (
-        *shaped,
-        *spec.skins,
-        *spec.meshes,
-        *spec.hfields,
-        *spec.materials,
-        *spec.textures,
-    ):
+    assets = (spec.skins, spec.meshes, spec.hfields, spec.materials, spec.textures)
+    for part in (*shaped, *(part for parts in assets for part in parts)):
         spec.delete(part)
     try:
         return spec.compile(), spec
     except ValueError as error:
-        hint = (
-            f" No inertial says what {', '.join(sorted(bare))} weighs, and its mesh is missing."
-            if bare
-            else ""
-        )
+        hint = ""
+        if bare:
+            names = ", ".join(sorted(bare))
+            hint = f" No inertial says what {names} weighs, and its mesh is missing."
         raise ModelFileError(f"MuJoCo refuses {where}: {_first_line(error)}.{hint}") from None
-
-
-def _is_about_files(error: Exception) -> bool:
-    return any(word in str(error).lower() for word in ("file", "mesh", "texture", "resource"))
 
 
 def _mimics(text: str) -> list[str]:

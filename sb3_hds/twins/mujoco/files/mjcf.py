@@ -1,4 +1,4 @@
-"""A corrected twin as MJCF: the source of the model, changed by MuJoCo itself."""
+"""A corrected twin as MJCF: the ``MjSpec`` of the source, with changes."""
 
 import dataclasses
 import math
@@ -10,16 +10,21 @@ from typing import Any
 import numpy as np
 
 from sb3_hds.errors import ModelFileError
-from sb3_hds.twins.mujoco.files.correction import DIGITS, OF_JOINTS, Correction, changed_bodies
+from sb3_hds.twins.mujoco.files.correction import (
+    DIGITS,
+    OF_JOINTS,
+    Correction,
+    changed_bodies,
+    in_body_frame,
+)
 from sb3_hds.twins.mujoco.files.load import spec_of
 from sb3_hds.twins.mujoco.files.reading import read
 from sb3_hds.twins.mujoco.library import mujoco
 from sb3_hds.twins.mujoco.mechanism import Drive, Link, Mechanism
 from sb3_hds.twins.mujoco.parameters import gravity_of
-from sb3_hds.twins.mujoco.rigid_body import algebra as alg
 
 # Share of a joint's motion that its dry friction may stop in a step: MuJoCo's impedance.
-_DAMPED = 0.99
+_IMPEDANCE = 0.99
 
 
 def mjcf_of(correction: Correction, source: Any, target: Path) -> str:
@@ -32,11 +37,7 @@ def mjcf_of(correction: Correction, source: Any, target: Path) -> str:
     by_id = {joint.id: joint for joint in spec.joints}
     for index, link in enumerate(mechanism.links):
         _write_joint(correction, by_id[index], link, float(spec.option.timestep))
-    tilted = [
-        name
-        for name in correction.values
-        if name.startswith("tilt_") and correction.difference(name)
-    ]
+    tilted = [n for n in correction.values if n.startswith("tilt_") and correction.difference(n)]
     if tilted:
         spec.option.gravity = np.array(gravity_of(mechanism, correction.values), float)
         for name in tilted:
@@ -51,7 +52,7 @@ def mjcf_of(correction: Correction, source: Any, target: Path) -> str:
         actuators = [_added(spec, by_id[d.link], d) for d in mechanism.drives]
         correction.changed += [f"actuator {drive.name}" for drive in mechanism.drives]
     for actuator, drive, before in zip(actuators, drives, mechanism.drives, strict=True):
-        # A damping ratio is of the masses that the file came with; its damping stays what it was.
+        # A damping ratio depends on the masses: write the damping that it meant in the source.
         by_ratio = drive.kind != "dcmotor" and float(actuator.biasprm[2]) > 0.0
         if drive != before or by_ratio:
             _write_gains(actuator, drive)
@@ -81,24 +82,24 @@ def _write_joint(correction: Correction, joint: Any, link: Link, step: float) ->
         change = correction.difference(full)
         if not change:
             continue
-        # What actuators bring along stays theirs.
+        # Damping and armature of actuators, which the twin adds, stay with them.
         now = np.array(getattr(joint, name), float)
         now.reshape(-1)[0] = max(0.0, round(float(now.reshape(-1)[0]) + change, DIGITS))
         setattr(joint, name, now if now.ndim else float(now))
         correction.record_change(full)
     if correction.values.get(f"{link.joint}_frictionloss", link.friction[0]) > 0.0:
-        # By default MuJoCo's dry friction is soft: below some speed, of a light joint a fast one,
-        # it is viscous. The twin's is not, and so this stops what it can stop within a step.
-        share = _DAMPED
-        joint.solimp_friction = np.array([share, share, *np.array(joint.solimp_friction)[2:]])
-        joint.solref_friction = np.array([-1.0, -share / step])
+        # By default MuJoCo's dry friction is viscous below some speed, a high one for light joints.
+        # These settings stop a joint within a step instead, like the twin's friction.
+        impedance = [_IMPEDANCE, _IMPEDANCE, *np.array(joint.solimp_friction)[2:]]
+        joint.solimp_friction = np.array(impedance)
+        joint.solref_friction = np.array([-1.0, -_IMPEDANCE / step])
         correction.changed.append(
             f"dry friction of {link.joint} holds within a step (solreffriction)"
         )
 
 
 def _corrected(correction: Correction, drive: Drive) -> Drive:
-    """With calibrated gains."""
+    """The drive with calibrated gains."""
     own = {
         name: correction.values[f"{drive.name}_{name}"]
         for name in ("gain", "kp", "kv", "motorconst", "resistance")
@@ -158,18 +159,17 @@ def _write_effects(correction: Correction, spec: Any, actuators: list[Any]) -> N
     step = float(spec.option.timestep)
     for name, index, key, own in correction.effects:
         single = name in _OF_ACTUATORS and index in firsts[:-1]
-        row = firsts.index(index) if single else -1
-        alone = single and len(correction.mechanism.drives[row].inputs) == 1
-        if alone and _OF_ACTUATORS[name](
-            actuators[row], correction.mechanism.drives[row], own, step
-        ):
-            correction.changed += [f"{key}.{short}: {value:.6g}" for short, value in own.items()]
-        else:
-            correction.left_out += [f"{key}.{short}: {value:.6g}" for short, value in own.items()]
+        written = False
+        if single:
+            row = firsts.index(index)
+            drive = correction.mechanism.drives[row]
+            alone = len(drive.inputs) == 1
+            written = alone and _OF_ACTUATORS[name](actuators[row], drive, own, step)
+        correction.record_effect(key, own, written=written)
 
 
 def _write_delay(actuator: Any, drive: Drive, own: Mapping[str, float], step: float) -> bool:
-    """MuJoCo keeps samples of commands, one for each step, since 3.5."""
+    """Since 3.5, MuJoCo can delay commands by samples, one for each step."""
     if not hasattr(actuator, "delay"):
         return False
     if own["delay"] > 0.0:
@@ -182,14 +182,14 @@ def _write_lag(actuator: Any, drive: Drive, own: Mapping[str, float], step: floa
     mj = mujoco()
     if own["time_constant"] > 0.0:
         actuator.dyntype = mj.mjtDyn.mjDYN_FILTEREXACT
-        dynamics_of = np.array(actuator.dynprm, float)
-        dynamics_of[0] = round(own["time_constant"], DIGITS)
-        actuator.dynprm = dynamics_of
+        dynamics = np.array(actuator.dynprm, float)
+        dynamics[0] = round(own["time_constant"], DIGITS)
+        actuator.dynprm = dynamics
     return True
 
 
 def _write_limit(actuator: Any, drive: Drive, own: Mapping[str, float], step: float) -> bool:
-    """A limit of zero is none."""
+    """A limit of zero means no limit."""
     limit = own["limit"]
     if limit > 0.0:
         low, high = drive.ranges[0] or (-math.inf, math.inf)
@@ -199,7 +199,7 @@ def _write_limit(actuator: Any, drive: Drive, own: Mapping[str, float], step: fl
 
 
 def _write_gain(actuator: Any, drive: Drive, own: Mapping[str, float], step: float) -> bool:
-    """Of a servo: its target counts for more, or less."""
+    """For a servo: the gain of its target."""
     if drive.kind != "affine":
         return False
     gain = np.array(actuator.gainprm, float)
@@ -217,7 +217,7 @@ _OF_ACTUATORS = {
 
 
 def _write_bodies(correction: Correction, spec: Any, model: Any) -> None:
-    """What is rigidly carried by a joint is one body of the twin: the first of them changes."""
+    """Bodies that are rigidly attached to one joint are one body of the twin: change the first."""
     wanted = changed_bodies(correction)
     if not wanted:
         return
@@ -233,25 +233,21 @@ def _write_bodies(correction: Correction, spec: Any, model: Any) -> None:
     for i, new in wanted.items():
         link = mechanism.links[i]
         assert link.body is not None
-        own = [b for b, at in link_of.items() if at == i and model.body_mass[b] > 0.0]
-        first = own[0]
-        turn, origin = np.array(link.body.rotation), np.array(link.body.origin)
-        # Of the whole, in the frame of the first body: mass, first and second moments.
-        mass = float(new.mass)
-        centre = turn.T @ (np.array([float(x) for x in new.centre]) - origin)
-        second = turn.T @ np.array(alg.full(new.second_moments), float) @ turn
+        first, *others = (b for b, at in link_of.items() if at == i and model.body_mass[b] > 0.0)
+        # Total mass, first and second moments in the frame of the first body, ...
+        mass, centre, second = in_body_frame(link.body, new)
         second = second + mass * np.outer(centre, centre)
         axes, at = data.xmat[first].reshape(3, 3), data.xpos[first]
         moment = mass * centre
-        for b in own[1:]:
+        # ... less those of the other bodies.
+        for b in others:
             other, held = data.ximat[b].reshape(3, 3), float(model.body_mass[b])
             place = axes.T @ (data.xipos[b] - at)
             inertia = axes.T @ other @ np.diag(model.body_inertia[b]) @ other.T @ axes
             mass, moment = mass - held, moment - held * place
             second = second - (0.5 * np.trace(inertia) * np.eye(3) - inertia)
             second = second - held * np.outer(place, place)
-        body = by_id[first]
-        _write_inertial(correction, body, mass, moment, second)
+        _write_inertial(correction, by_id[first], mass, moment, second)
 
 
 def _write_inertial(
@@ -271,7 +267,7 @@ def _write_inertial(
 
 
 def _keep_assets(spec: Any, source: Path, target: Path) -> None:
-    """Meshes and textures stay where they are."""
+    """Make relative paths of meshes and textures valid in the target's folder."""
     there, here = source.resolve().parent, target.resolve().parent
     if there == here or not (spec.meshes or spec.hfields or spec.textures or spec.skins):
         return

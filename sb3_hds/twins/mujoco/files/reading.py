@@ -1,4 +1,4 @@
-"""Read the numbers of a mechanism from a compiled model of MuJoCo."""
+"""Read a mechanism from a compiled model of MuJoCo."""
 
 from typing import Any
 
@@ -19,19 +19,18 @@ from sb3_hds.twins.mujoco.mechanism import (
     Place,
 )
 
-# Of mjtJoint.
-_KINDS = (FREE, BALL, SLIDE, HINGE)
-#: inputs of servos and motors with several, in their order: the bits of mjtInput
+_KINDS = (FREE, BALL, SLIDE, HINGE)  # mjtJoint
+# Inputs of servos and motors with several inputs, in order: the bits of mjtInput.
 _INPUTS = {"pos": 1, "vel": 2, "ff": 4, "voltage": 8}
-# What is nearer to 0 or 1 than this comes from rounding, as of pi / 2 in a URDF.
+# Numbers nearer to 0, 1 or -1 than this differ by rounding, as of pi / 2 in a URDF.
 _ROUNDING = 1e-10
-# Products of inertia below this share of the largest moment of inertia are rounding.
+# Products of inertia below this share of the largest moment of inertia are rounding errors.
 _OF_INERTIA = 1e-13
 
 
 def read(model: Any, *, integrator: str | None = None) -> Mechanism:
     """
-    :param model: compiled; what the dynamics cannot do has been refused already
+    :param model: compiled, without unsupported features
     :param integrator: instead of the model's: ``"euler"``, ``"implicitfast"`` or ``"rk4"``
     :raises ParameterError: for another integrator
     """
@@ -85,8 +84,8 @@ def _integrator(model: Any, wanted: str | None) -> str:
     found = integrator_of(model) if wanted is None else str(wanted).lower()
     if found not in ("euler", "implicitfast", "rk4"):
         raise ParameterError(
-            f"The integrator '{found}' is not among those that a twin has: pass "
-            "integrator='implicitfast', 'euler' or 'rk4'."
+            f"The integrator '{found}' is not supported: pass integrator='implicitfast', 'euler' "
+            "or 'rk4'."
         )
     return found
 
@@ -128,13 +127,13 @@ def _link(
 
 
 def _with_powers(model: Any, name: str) -> np.ndarray:
-    """A coefficient and those of higher order, which older versions of MuJoCo do not have."""
+    """A coefficient and those of higher order, which older versions of MuJoCo lack."""
     linear = getattr(model, name)
     return np.column_stack([linear, getattr(model, f"{name}poly", np.zeros((len(linear), 0)))])
 
 
 def _of_actuators(model: Any, j: int) -> tuple[float, Any]:
-    """Armature and damping that actuators of a joint bring along."""
+    """Armature and damping that the actuators of a joint add to it."""
     if not hasattr(model, "actuator_armature"):
         return 0.0, 0.0
     of_joint = np.isin(model.actuator_trntype, (0, 1)) & (model.actuator_trnid[:, 0] == j)
@@ -146,7 +145,7 @@ def _of_actuators(model: Any, j: int) -> tuple[float, Any]:
 def _body(
     model: Any, data: Any, bodies: list[int], frame: np.ndarray, origin: np.ndarray
 ) -> Body | None:
-    """All that moves with a link, as one body."""
+    """All bodies that move with a link, as one body."""
     bodies = [b for b in bodies if model.body_mass[b] > 0.0]
     if not bodies:
         return None
@@ -228,7 +227,7 @@ def _motor(gain: Any, bias: Any) -> tuple[tuple[str, float], ...]:
 
 
 def n_actuators(model: Any) -> int:
-    """:return: fewer than commands where one actuator takes several"""
+    """:return: number of actuators, each of which may have several commands"""
     return int(getattr(model, "nactuator", model.nu))
 
 
@@ -242,7 +241,7 @@ def _places(
     link_of_body: dict[int, int],
     frames: dict[int, tuple[np.ndarray, np.ndarray]],
 ) -> list[Place]:
-    """Sites, and bodies by their origin where no site has the name."""
+    """Sites, and origins of bodies whose names no site has."""
     sites = [
         (model.site(i).name, int(model.site_bodyid[i]), data.site_xpos[i], data.site_xmat[i])
         for i in range(model.nsite)
@@ -269,7 +268,7 @@ def _name_of(model: Any) -> str:
 
 
 def _with_z_along(axis: np.ndarray) -> np.ndarray:
-    """A rotation whose last column is an axis; where it can be, its entries are 0, 1 and -1."""
+    """A rotation whose last column is an axis; its entries are 0, 1 and -1 if possible."""
     axis = _rounded(axis / np.linalg.norm(axis))
     least = int(np.argmin(np.abs(axis)))
     x = np.eye(3)[least] - axis * axis[least]

@@ -1,18 +1,16 @@
-"""Features of a model that its twin does not simulate, refused with the remedy."""
+"""Errors for features of a model that its twin does not simulate, with the remedy."""
 
 from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 
-from sb3_hds.errors import ModelFileError
+from sb3_hds.errors import ModelFileError, first_names
 from sb3_hds.twins.mujoco.files.reading import n_actuators
 from sb3_hds.twins.mujoco.library import mujoco
 
-#: what may be left out of a twin on request
+#: features that a twin may omit on request
 IGNORABLE = ("contacts", "equality", "fluid", "limits", "tendons")
-
-_FEW = 3
 
 
 def refuse(model: Any, integrator: str, ignore: Collection[str]) -> None:
@@ -42,19 +40,19 @@ def _ignorable(model: Any) -> dict[str, str]:
     touching = contacts(model)
     if touching:
         found["contacts"] = (
-            f"Contacts can happen ({_some(touching)}), which the twin does not simulate."
+            f"Contacts can happen ({first_names(touching)}), which the twin does not simulate."
         )
     if _enabled(model, "EQUALITY") and model.neq and np.any(model.eq_active0):
         active = [
             model.equality(i).name or f"equality {i}" for i in np.flatnonzero(model.eq_active0)
         ]
         found["equality"] = (
-            f"Constraints close chains or couple joints ({_some(active)}), which the twin does not "
-            "simulate: joints would move apart."
+            f"Constraints close chains or couple joints ({first_names(active)}), which the twin "
+            "does not simulate: joints would move independently."
         )
     if model.ntendon:
         names = [model.tendon(i).name or f"tendon {i}" for i in range(model.ntendon)]
-        found["tendons"] = f"Tendons pull ({_some(names)}), which the twin does not simulate."
+        found["tendons"] = f"Tendons pull ({first_names(names)}), which the twin does not simulate."
     if model.opt.density or model.opt.viscosity:
         found["fluid"] = (
             f"A medium of density {model.opt.density:g} and viscosity {model.opt.viscosity:g} "
@@ -64,7 +62,7 @@ def _ignorable(model: Any) -> dict[str, str]:
 
 
 def _never(model: Any, integrator: str) -> list[str]:
-    """What cannot be left out either."""
+    """Messages for features that cannot be omitted."""
     mj = mujoco()
     found = []
     if model.nflex:
@@ -74,16 +72,17 @@ def _never(model: Any, integrator: str) -> list[str]:
     alone = _floating_alone(model)
     if alone and integrator == "implicitfast":
         found.append(
-            f"MuJoCo's implicitfast is another one for a body that floats alone ({_some(alone)}). "
-            "Pass integrator='euler' or 'rk4'."
+            "MuJoCo's implicitfast is another one for a body that floats alone "
+            f"({first_names(alone)}). Pass integrator='euler' or 'rk4'."
         )
-    on = {mj.mjtTrn.mjTRN_JOINT, mj.mjtTrn.mjTRN_JOINTINPARENT}
+    on = [int(mj.mjtTrn.mjTRN_JOINT), int(mj.mjtTrn.mjTRN_JOINTINPARENT)]
+    # Not all versions of MuJoCo have all of these.
+    gains = [getattr(mj.mjtGain, f"mjGAIN_{name}", None) for name in ("MUSCLE", "SO3", "USER")]
+    special = [int(gain) for gain in gains if gain is not None]
     kinds = {
         "with internal dynamics": model.actuator_actnum > 0,
-        "that are not attached to a joint": ~np.isin(model.actuator_trntype, [int(k) for k in on]),
-        "that are muscles or turn an orientation": np.isin(
-            model.actuator_gaintype, [int(k) for k in _special_gains()]
-        ),
+        "that are not attached to a joint": ~np.isin(model.actuator_trntype, on),
+        "that are muscles or turn an orientation": np.isin(model.actuator_gaintype, special),
         "with a delay": getattr(model, "actuator_delay", np.zeros(n_actuators(model))) > 0.0,
     }
     hints = {
@@ -94,14 +93,15 @@ def _never(model: Any, integrator: str) -> list[str]:
         names = [model.actuator(i).name or f"actuator {i}" for i in np.flatnonzero(wrong)]
         if names:
             hint = hints.get(words, "Use motors, position, velocity or dcmotor on joints.")
-            found.append(f"The twin has no actuators {words} ({_some(names)}). {hint}")
+            found.append(f"The twin has no actuators {words} ({first_names(names)}). {hint}")
     gravcomp = np.flatnonzero(
         getattr(model, "jnt_actgravcomp", np.zeros(model.njnt)) & model.jnt_actfrclimited
     )
     if len(gravcomp) and np.any(model.body_gravcomp):
         names = [model.joint(int(j)).name for j in gravcomp]
         found.append(
-            f"Actuators with a limit compensate gravity ({_some(names)}). Set actgravcomp='false'."
+            f"Actuators with a limit compensate gravity ({first_names(names)}). "
+            "Set actgravcomp='false'."
         )
     return found
 
@@ -115,15 +115,15 @@ def contacts(model: Any) -> list[str]:
     kinds, affinities = model.geom_contype, model.geom_conaffinity
     meeting = (kinds[own] & affinities[other]) | (kinds[other] & affinities[own])
     one, two = weld[body[own]], weld[body[other]]
-    apart = one != two
+    separate = one != two
     if _enabled(model, "FILTERPARENT"):
         parent = weld[model.body_parentid[weld]]
         above = (one != 0) & (two != 0)
-        apart &= ~(above & ((one == parent[body[other]]) | (two == parent[body[own]])))
+        separate &= ~(above & ((one == parent[body[other]]) | (two == parent[body[own]])))
     low, high = np.minimum(body[own], body[other]), np.maximum(body[own], body[other])
     pair = (low.astype(np.int64) << 16) + high
-    apart &= ~np.isin(pair, model.exclude_signature[: model.nexclude])
-    found = [(int(own[i]), int(other[i])) for i in np.flatnonzero((meeting > 0) & apart)]
+    separate &= ~np.isin(pair, model.exclude_signature[: model.nexclude])
+    found = [(int(own[i]), int(other[i])) for i in np.flatnonzero((meeting > 0) & separate)]
     found += [(int(model.pair_geom1[i]), int(model.pair_geom2[i])) for i in range(model.npair)]
     return [f"{_geom(model, a)} and {_geom(model, b)}" for a, b in found]
 
@@ -143,21 +143,6 @@ def _floating_alone(model: Any) -> list[str]:
     return found
 
 
-def _special_gains() -> list[Any]:
-    mj = mujoco()
-    gains = mj.mjtGain
-    return [
-        getattr(gains, f"mjGAIN_{n}")
-        for n in ("MUSCLE", "SO3", "USER")
-        if hasattr(gains, f"mjGAIN_{n}")
-    ]
-
-
 def _enabled(model: Any, name: str) -> bool:
     mj = mujoco()
     return not model.opt.disableflags & getattr(mj.mjtDisableBit, f"mjDSBL_{name}")
-
-
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - _FEW} more" if len(names) > _FEW else ""
-    return ", ".join(names[:_FEW]) + more

@@ -10,7 +10,7 @@ import numpy as np
 from sb3_hds.twins.mujoco.library import mujoco
 from sb3_hds.twins.mujoco.mechanism import Place, Shape
 
-# What MuJoCo reads.
+# Mesh formats that MuJoCo reads.
 _FORMATS = (".obj", ".stl")
 # Directions in which the outermost vertex of a mesh is kept.
 _N_DIRECTIONS = 64
@@ -19,8 +19,8 @@ _N_DIRECTIONS = 64
 def shapes_of(model: Any, places: Sequence[Place]) -> tuple[Shape, ...]:
     """
     :param model: compiled with its meshes
-    :param places: frames of its bodies in those of the links
-    :return: one for each geom that is a mesh, of a body that has a name which no site has
+    :param places: frames of its bodies, relative to the links
+    :return: one for each mesh geom of a body whose name no site has
     """
     frames = {"world": Place("world", -1, (0.0, 0.0, 0.0), tuple(map(tuple, np.eye(3))))}
     sites = {model.site(i).name for i in range(model.nsite)}
@@ -43,12 +43,12 @@ def shapes_of(model: Any, places: Sequence[Place]) -> tuple[Shape, ...]:
 
 def visuals_of(text: str, folder: Path) -> Any:
     """
-    MuJoCo drops what only shows of a URDF, and fails where a file is missing.
+    The visual meshes of a URDF: MuJoCo drops them, and fails if a file is missing.
 
     :param text: of a URDF
-    :param folder: in which it lies
-    :return: a compiled model of loose bodies, named as the links, with the meshes that are there;
-        None where there are none, or they make no sense: a twin can do without
+    :param folder: of its file
+    :return: a compiled model of loose bodies, named as the links, with the existing meshes; None
+        without any, or if they cannot be read
     """
     try:
         return _loose_bodies(ElementTree.fromstring(text), folder)
@@ -67,18 +67,14 @@ def _loose_bodies(robot: ElementTree.Element, folder: Path) -> Any:
             if mesh is None or path is None:
                 continue
             at = {} if origin is None else origin.attrib
-            scale, place, turn = (
-                [float(x) for x in given.split()]
-                for given in (
-                    mesh.get("scale", "1 1 1"),
-                    at.get("xyz", "0 0 0"),
-                    at.get("rpy", "0 0 0"),
-                )
-            )
+            scale = [float(x) for x in mesh.get("scale", "1 1 1").split()]
+            place, turn = ([float(x) for x in at.get(n, "0 0 0").split()] for n in ("xyz", "rpy"))
             quaternion = np.zeros(4)
             mj.mju_euler2Quat(quaternion, turn, "XYZ")
             spec.add_mesh(name=f"mesh{n}", file=str(path), scale=scale)
-            body = body or _body_of(spec, link.get("name", ""))
+            if body is None:
+                name, world = link.get("name", ""), spec.worldbody
+                body = world if name == "world" else world.add_body(name=name)
             body.add_geom(
                 type=mj.mjtGeom.mjGEOM_MESH, meshname=f"mesh{n}", pos=place, quat=quaternion
             )
@@ -86,12 +82,8 @@ def _loose_bodies(robot: ElementTree.Element, folder: Path) -> Any:
     return spec.compile() if n else None
 
 
-def _body_of(spec: Any, name: str) -> Any:
-    return spec.worldbody if name == "world" else spec.worldbody.add_body(name=name)
-
-
 def _found(name: str, folder: Path) -> Path | None:
-    """A mesh by the end of its path: the root of its package is unknown."""
+    """Find a mesh by the end of its path, because the root of its package is unknown."""
     parts = Path(name.partition("://")[2] or name).parts
     for first in range(len(parts)):
         path = folder.joinpath(*parts[first:])

@@ -8,9 +8,15 @@ from xml.etree import ElementTree
 import numpy as np
 
 from sb3_hds.errors import ModelFileError
-from sb3_hds.twins.mujoco.files.correction import DIGITS, OF_JOINTS, Correction, changed_bodies
-from sb3_hds.twins.mujoco.mechanism import Link
-from sb3_hds.twins.mujoco.rigid_body import algebra as alg
+from sb3_hds.twins.mujoco.files.correction import (
+    DIGITS,
+    OF_JOINTS,
+    Correction,
+    changed_bodies,
+    in_body_frame,
+)
+from sb3_hds.twins.mujoco.mechanism import Body, Link
+from sb3_hds.twins.mujoco.parameters import of_body
 from sb3_hds.twins.mujoco.rigid_body import spatial
 
 
@@ -25,7 +31,7 @@ def urdf_of(correction: Correction, source: Any) -> str:
     try:
         robot = ElementTree.fromstring(text, ElementTree.XMLParser(target=builder))
     except ElementTree.ParseError as error:
-        raise ModelFileError(f"The source is no XML: {error}.") from None
+        raise ModelFileError(f"The source is not XML: {error}.") from None
     if robot.tag != "robot":
         raise ModelFileError(
             "A URDF is written only where the twin comes from one. Write MJCF: name the file .xml."
@@ -38,23 +44,15 @@ def urdf_of(correction: Correction, source: Any) -> str:
         body = correction.mechanism.links[i].body
         assert body is not None
         _write_urdf_inertial(correction, links.get(body.name), body, new)
-    in_file = {
-        f"{link.joint}_{name}" for link in correction.mechanism.links for name in OF_JOINTS[:2]
-    }
-    inertial = correction.plant.masses or correction.plant.payload is not None
-    bodies = (
-        [link.body.name for link in correction.mechanism.links if link.body] if inertial else []
-    )
-    ends = ("_mass", "_com_", "_stretch_", "_shear_")
-    in_bodies = {
-        n for n in correction.values for b in bodies for e in ends if n.startswith(f"{b}{e}")
-    }
-    in_bodies |= {name for name in correction.values if "_payload" in name}
+    recorded = {name for name in correction.values if "_payload" in name}
+    for link in correction.mechanism.links:
+        recorded |= {f"{link.joint}_{name}" for name in OF_JOINTS[:2]}
+        recorded |= set(of_body(link.body) if link.body else ())
     for name in correction.values:
-        if correction.difference(name) and name not in in_file | in_bodies:
+        if correction.difference(name) and name not in recorded:
             correction.record_left_out(name)
     for _, _, key, own in correction.effects:
-        correction.left_out += [f"{key}.{short}: {value:.6g}" for short, value in own.items()]
+        correction.record_effect(key, own, written=False)
     body = ElementTree.tostring(robot, encoding="unicode")
     return f'<?xml version="1.0"?>\n{body}\n'
 
@@ -67,16 +65,14 @@ def _write_urdf_joint(correction: Correction, joint: Any, link: Link) -> None:
         if joint is None:
             correction.record_left_out(full)
             continue
-        dynamics_of = joint.find("dynamics")
-        if dynamics_of is None:
-            dynamics_of = ElementTree.SubElement(joint, "dynamics")
-            dynamics_of.tail = "\n"
-        dynamics_of.set(attribute, f"{correction.values[full]:.{DIGITS}g}")
+        dynamics = _child(joint, "dynamics")
+        dynamics.tail = dynamics.tail or "\n"
+        dynamics.set(attribute, f"{correction.values[full]:.{DIGITS}g}")
         correction.record_change(full)
 
 
-def _write_urdf_inertial(correction: Correction, link: Any, body: Any, new: spatial.Body) -> None:
-    """Only where nothing else is rigidly carried: then the link is the twin's body."""
+def _write_urdf_inertial(correction: Correction, link: Any, body: Body, new: spatial.Body) -> None:
+    """Only if the link carries no other links rigidly: then it is the body of the twin."""
     own = None if link is None else link.find("inertial")
     mass = None if own is None else own.find("mass")
     held = math.nan if mass is None else float(mass.get("value", "nan"))
@@ -85,22 +81,20 @@ def _write_urdf_inertial(correction: Correction, link: Any, body: Any, new: spat
             f"mass and inertia of {body.name}, which carries other links rigidly"
         )
         return
-    turn, origin = np.array(body.rotation), np.array(body.origin)
-    centre = turn.T @ (np.array([float(x) for x in new.centre]) - origin)
-    second = turn.T @ np.array(alg.full(new.second_moments), float) @ turn
+    new_mass, centre, second = in_body_frame(body, new)
     inertia = np.trace(second) * np.eye(3) - second
     number = lambda x: f"{float(x):.{DIGITS}g}"  # noqa: E731
-    mass.set("value", number(new.mass))
-    place = own.find("origin")
-    if place is None:
-        place = ElementTree.SubElement(own, "origin")
+    mass.set("value", number(new_mass))
+    place = _child(own, "origin")
     place.set("xyz", " ".join(map(number, centre)))
     place.set("rpy", "0 0 0")
-    matrix = own.find("inertia")
-    if matrix is None:
-        matrix = ElementTree.SubElement(own, "inertia")
-    for i, row in enumerate("xyz"):
-        for j, column in enumerate("xyz"):
-            if j >= i:
-                matrix.set(f"i{row}{column}", number(inertia[i, j]))
-    correction.changed.append(f"inertial of {body.name}: {float(new.mass):.6g} kg")
+    matrix = _child(own, "inertia")
+    for i, j in zip(*np.triu_indices(3), strict=True):
+        matrix.set(f"i{'xyz'[i]}{'xyz'[j]}", number(inertia[i, j]))
+    correction.changed.append(f"inertial of {body.name}: {new_mass:.6g} kg")
+
+
+def _child(parent: ElementTree.Element, tag: str) -> ElementTree.Element:
+    """Its child of that tag, added where it is missing."""
+    found = parent.find(tag)
+    return ElementTree.SubElement(parent, tag) if found is None else found

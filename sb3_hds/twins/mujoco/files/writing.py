@@ -1,11 +1,14 @@
-"""Export of a corrected twin to a model file, MJCF or URDF."""
+"""Export of corrected twins to model files, MJCF or URDF."""
 
 import dataclasses
 import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sb3_hds.core import Twin
+from sb3_hds.core.belief import BeliefTwin
 from sb3_hds.core.trajectories.storage import check_target, write_bytes
 from sb3_hds.core.twin import plant_of
 from sb3_hds.errors import ModelFileError
@@ -39,14 +42,13 @@ def write_model(twin: Twin, path: str | os.PathLike[str], source: Any) -> Writte
     """
     Write a calibrated or extended twin of a model file as a corrected copy of that file.
 
-    An MJCF file carries friction loss, damping, armature, stiffness, gains, gravity, masses with
-    centres and inertias, a payload, and delays, time constants and limits of actuators; besides,
-    the step and the integrator of the twin, so that ``mj_step``, ``substeps`` times a control
-    interval, does what the twin does. Dry friction then is MuJoCo's, which sticks. A URDF carries
-    damping, friction and inertials; what a format cannot express is listed. Missing meshes are left
-    out of MJCF.
+    MJCF gets friction loss, damping, armature, stiffness, gains, gravity, masses with centres and
+    inertias, a payload, and delays, time constants and limits of actuators; also the time step and
+    integrator of the twin, so that ``substeps`` calls of ``mj_step`` per control interval reproduce
+    it. Dry friction is then MuJoCo's, which sticks. A URDF gets damping, friction and inertials.
+    Changes that the format cannot express are listed. Missing meshes are left out of MJCF.
 
-    :param twin: made by ``twins.from_mujoco``, with other parameters, or with effects
+    :param twin: made by ``twins.from_mujoco``, with other parameters or with effects
     :param path: ``.xml`` or ``.mjcf`` for MJCF, ``.urdf`` for a URDF, which needs one as its source
     :param source: of the twin: path or text of an MJCF or URDF file, or an ``MjSpec``
     :raises ModelFileError: for another twin, or another robot than the twin's
@@ -69,3 +71,30 @@ def write_model(twin: Twin, path: str | os.PathLike[str], source: Any) -> Writte
     )
     write_bytes(target, content.encode())
     return Written(target, tuple(correction.changed), tuple(correction.left_out))
+
+
+def write_models(
+    belief: BeliefTwin, folder: str | os.PathLike[str], source: Any, n: int = 16
+) -> list[Written]:
+    """
+    Write draws of a belief as corrected copies of a model file, each as :func:`write_model` does.
+    ``NAME_00.xml`` is the likeliest answer; the others are spread evenly over the draws, so that
+    each answer has its share.
+
+    :param belief: over a twin that ``twins.from_mujoco`` made
+    :param folder: made if missing; files of the same names are replaced
+    :param source: of the twin: path or text of an MJCF file, or an ``MjSpec``
+    :param n: number of files, at most that of the draws
+    :return: one result for each file
+    :raises ModelFileError: for fewer than one file, or a twin that was not made from a model file
+    """
+    if n < 1:
+        raise ModelFileError(f"n must be at least one file, got {n}.")
+    numbers = np.unique(np.linspace(0, belief.n_draws - 1, n).round().astype(int))
+    members = [belief.member(int(i)) for i in numbers]
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    digits = max(2, len(str(len(members) - 1)))
+    return [
+        write_model(member, Path(folder) / f"{belief.name}_{i:0{digits}d}.xml", source)
+        for i, member in enumerate(members)
+    ]

@@ -1,9 +1,9 @@
 """
 Vectors and matrices of three rows, component by component, with constants folded.
 
-A component is a float where it is a constant, and otherwise an array, of JAX or of NumPy, that has
-one entry for each link. Products with zero and one disappear from the program, so that a planar
-mechanism costs what its planar formulas cost; and all that XLA sees are element-wise operations.
+A constant component is a float; any other is an array of JAX or NumPy with one entry for each link.
+Products with zero and one disappear from the program, so a planar mechanism costs as much as its
+planar formulas, and XLA compiles element-wise operations only.
 """
 
 import math
@@ -121,7 +121,7 @@ def sadd(a: Symmetric, b: Symmetric) -> Symmetric:
 
 
 def outer(a: Sequence[Number], b: Sequence[Number]) -> Symmetric:
-    """:return: the symmetric part of ``a b^T``, twice: ``a b^T + b a^T``"""
+    """:return: ``a b^T + b a^T``"""
     return tuple(add(mul(a[i], b[j]), mul(b[i], a[j])) for i, j in PLACES)  # type: ignore[return-value]
 
 
@@ -140,7 +140,7 @@ def exp(x: Number) -> Number:
 def gathered(numbers: Sequence[Number], dtype: Any) -> Number:
     """
     :param numbers: of each link
-    :return: all of them along a new last axis, or one float that they have in common
+    :return: all numbers along a new last axis, or one float if all are the same float
     """
     if all(isinstance(x, float) for x in numbers):
         same = all(x == numbers[0] for x in numbers)
@@ -153,7 +153,7 @@ def gathered(numbers: Sequence[Number], dtype: Any) -> Number:
 
 
 def rotation(q: Sequence[Number]) -> Matrix:
-    """:return: of a quaternion of any length but zero: what turns a vector into the outer frame"""
+    """:return: rotation to the outer frame, from a quaternion of any length but zero"""
     w, x, y, z = q
     s = div(2.0, dot(q, q))
     xx, yy, zz = (mul(s, mul(a, a)) for a in (x, y, z))
@@ -167,14 +167,14 @@ def rotation(q: Sequence[Number]) -> Matrix:
 
 
 def _alike(a: Number, b: Number) -> bool:
-    """Whether XLA's own operation does: it is traced in a fraction of the time."""
+    """Whether an operation of ``jax.lax`` applies, which is traced in a fraction of the time."""
     if not (isinstance(a, jax.Array) or isinstance(b, jax.Array)):
         return False
     return isinstance(a, float) or isinstance(b, float) or np.shape(a) == np.shape(b)
 
 
 def _typed(a: Number, b: Number) -> tuple[Number, Number]:
-    """Floats in the precision of the other number."""
+    """Both numbers, with floats in the precision of the other one."""
     a = b.dtype.type(a) if isinstance(a, float) else a
     return a, a.dtype.type(b) if isinstance(b, float) else b
 

@@ -1,10 +1,10 @@
 r"""
-Rigid-body dynamics of a tree, and its derivatives, for all degrees of freedom side by side.
+Rigid-body dynamics of a tree, and its derivatives, for all degrees of freedom at once.
 
-Spatial vectors are expressed in the axes of the world, about one point at rest. A sum over the
-bodies that a joint moves, or over the joints that move a body, is then a product with a constant
-matrix of zeros and ones, and only orientations are computed joint by joint: the program hardly
-grows with the number of joints.
+Spatial vectors are expressed in the axes of the world, about one fixed point. A sum over the bodies
+that a joint moves, or over the joints that move a body, is then a product with a constant matrix of
+zeros and ones, and only orientations are computed joint by joint: the program hardly grows with the
+number of joints.
 
 Source: Featherstone, *Rigid Body Dynamics Algorithms*, Springer 2008, chapters 2, 5 and 6; Singh,
 Russell and Wensing, *Efficient analytical derivatives of rigid-body dynamics using spatial vector
@@ -50,7 +50,7 @@ class Configuration(NamedTuple):
 
     :param axes: motion at unit speed of each degree of freedom
     :param inertia: of each body
-    :param compensated: mass of each body whose weight something else carries; None: none
+    :param compensated: mass of each body with compensated weight; None: no compensation
     """
 
     axes: Motion
@@ -60,17 +60,16 @@ class Configuration(NamedTuple):
 
 class Tree:
     """
-    Which joints move which bodies, as matrices of zeros and ones.
-
-    A free joint counts as three slides and a ball.
+    Which joints move which bodies, as matrices of zeros and ones. A free joint counts as three
+    slides and a ball.
 
     :param links: parents first
     :param dtype: of the matrices
     """
 
-    #: row i: the degrees of freedom of the joints below that of i
+    #: row i: degrees of freedom of the joints between the world and the joint of i
     below: np.ndarray
-    #: row i: those, and the ones of its own joint
+    #: row i: the same, and those of the joint of i
     upto: np.ndarray
     #: row b: the degrees of freedom that move body b
     moving: np.ndarray
@@ -79,7 +78,7 @@ class Tree:
         self.links, self.dtype = links, dtype
         self.n = sum(len(link.dofs) for link in links)
         self.bodies = [i for i, link in enumerate(links) if link.body]
-        self.has_balls = any(link.kind in (BALL, FREE) for link in links)
+        self.has_balls = any(link.quaternion for link in links)
         self.below, own = np.zeros((self.n, self.n), dtype), np.eye(self.n, dtype=dtype)
         carriers: list[list[int]] = []
         for link in links:
@@ -100,12 +99,12 @@ def configuration(
     """
     Forward kinematics.
 
-    Where a tree is along the slides at its root does not matter, so it is left out: the common
+    Displacements along slides at the root of the tree do not matter and are left out: the reference
     point moves along.
 
     :param q: numbers of the position
     :param bodies: in the order of ``tree.bodies``
-    :param compensated: likewise, masses whose weight something else carries
+    :param compensated: masses with compensated weight, in the order of ``tree.bodies``
     """
     rotations: list[Matrix] = []
     origins: list[Vector] = []
@@ -129,13 +128,13 @@ def configuration(
     carried = None
     if any(compensated):
         none = Body(0.0, alg.ZERO, alg.NOTHING)
-        every = side_by_side([each or none for each in compensated], tree.dtype)
-        carried = placed(every, rotation, origin)
+        masses = side_by_side([each or none for each in compensated], tree.dtype)
+        carried = placed(masses, rotation, origin)
     return Configuration(side_by_side(axes, tree.dtype), inertia, carried)
 
 
 def frames_of(links: Sequence[Link], q: Sequence[Number]) -> list[tuple[Matrix, Vector]]:
-    """:return: of each link, rotation and origin in the world [m]"""
+    """:return: rotation and origin of each link in the world [m]"""
     rotations: list[Matrix] = []
     origins: list[Vector] = []
     for link in links:
@@ -149,7 +148,7 @@ def frames_of(links: Sequence[Link], q: Sequence[Number]) -> list[tuple[Matrix, 
 
 
 def _mounted(link: Link, rotation: Matrix, origin: Vector) -> tuple[Matrix, Vector]:
-    """The frame of a link where its joint is at its reference, from that of its parent."""
+    """The frame of a link at the reference of its joint, from that of its parent."""
     place = alg.vadd(origin, alg.apply(rotation, link.origin))
     return alg.product(rotation, link.rotation), place
 
@@ -160,8 +159,8 @@ def _through_joint(
     """The frame of a link, and the motions that its joint allows."""
     x, y, z = alg.transpose(rotation)
     if link.kind == SLIDE:
-        way = alg.sub(q[link.q], link.reference)
-        return rotation, alg.vadd(origin, alg.scale(way, z)), [Motion(alg.ZERO, z)]
+        displacement = alg.sub(q[link.q], link.reference)
+        return rotation, alg.vadd(origin, alg.scale(displacement, z)), [Motion(alg.ZERO, z)]
     if link.kind == HINGE:
         angle = alg.sub(q[link.q], link.reference)
         c, s = alg.cos(angle), alg.sin(angle)
@@ -171,17 +170,17 @@ def _through_joint(
             z,
         )
         return alg.transpose(turned), origin, [rotation_about(z, origin)]
-    last = link.q + link.n_q
-    rotation = alg.product(rotation, alg.rotation(q[last - 4 : last]))
+    assert link.quaternion is not None
+    rotation = alg.product(rotation, alg.rotation(q[link.quaternion]))
     axes = [rotation_about(axis, origin) for axis in alg.transpose(rotation)]
     if link.kind == FREE:
-        origin = alg.vadd(origin, q[link.q : link.q + 3])
+        origin = alg.vadd(origin, q[link.straight])
         axes = [*(Motion(alg.ZERO, unit) for unit in _UNIT), *axes]
     return rotation, origin, axes
 
 
 def mass_matrix(tree: Tree, at: Configuration) -> Number:
-    """:return: without armature, shape ``(n, n)``"""
+    """:return: the mass matrix without armature, shape ``(n, n)``"""
     momentum = momentum_of(sum_over(tree.moving, at.inertia), at.axes)
     entries = scalar_products(at.axes, momentum, tree.n)
     return tree.upto.T * entries + tree.below * entries.swapaxes(-1, -2)
@@ -204,8 +203,8 @@ def derivatives(
     tree: Tree, at: Configuration, v: Number, gravity: Vector, a: Number
 ) -> tuple[Number, Number]:
     r"""
-    :return: of inverse dynamics, by position (in the tangent space) and by velocity, both of shape
-        ``(n, n)``
+    :return: derivatives of inverse dynamics by position (in the tangent space) and by velocity,
+        both of shape ``(n, n)``
 
     With the subtree's inertia :math:`I`, force :math:`F` and :math:`B = \partial F / \partial v`
     of a body that does not turn, and :math:`S` for axes, :math:`\dot\Psi = v_\lambda \times S`,
@@ -216,7 +215,7 @@ def derivatives(
             + [S_j \times^* F_j]_{i < j}) \\
         \partial\tau_i / \partial v_j &= S_i \cdot (I (\dot\Psi_j + \dot S_j) + B S_j)
 
-    where :math:`I, B` are those of the later of the two joints.
+    with :math:`I, B` of the outer of the two joints.
     """
     motion, axes, n = _forward(tree, at, v, gravity, a), at.axes, tree.n
     inertia, force = sum_over(tree.moving, at.inertia), sum_over(tree.moving, motion.force)
@@ -224,7 +223,7 @@ def derivatives(
     psi_dot = cross(motion.velocity, axes)
     psi_ddot = plus(cross(motion.acceleration, axes), cross(motion.velocity, psi_dot))
     both = plus(psi_dot, motion.axis_rate)
-    # Rows are those of the later joint here, ...
+    # Rows belong to the outer joint here, ...
     momentum, transposed = momentum_of(inertia, axes), coriolis_transposed(coriolis, axes)
     later_q = scalar_products((momentum, transposed), (psi_ddot, psi_dot.angular), n)
     later_v = scalar_products((momentum, transposed), (both, axes.angular), n)
@@ -246,11 +245,11 @@ def derivatives(
 
 class _Kinematics(NamedTuple):
     """
-    :param velocity: of what each joint is mounted on
-    :param acceleration: of what each joint is mounted on, minus gravity
+    :param velocity: of the parent of each joint
+    :param acceleration: of the parent of each joint, minus gravity
     :param axis_rate: time derivative of each axis
     :param body_velocity: of each body
-    :param force: that each body needs
+    :param force: required force on each body
     """
 
     velocity: Motion

@@ -1,9 +1,9 @@
-"""Orientations as quaternions ``(w, x, y, z)``, and turns as rotation vectors."""
+"""Orientations as quaternions ``(w, x, y, z)``, and rotations as rotation vectors."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Squared angle [rad^2] below which the series of sine and cosine are exact to 1e-16.
+# Squared angle [rad^2] below which two terms of the series of sine and cosine suffice.
 _SMALL = 1e-8
 
 Quaternion = Float[Array, "4"]
@@ -11,7 +11,7 @@ Turn = Float[Array, "3"]  # in the body's frame [rad]
 
 
 def turned(q: Quaternion, turn: Turn) -> Quaternion:
-    """:return: the orientation after a turn, of length one"""
+    """:return: the orientation after a rotation, of length one"""
     squared = jnp.sum(turn**2)
     near = squared < _SMALL
     angle = jnp.sqrt(jnp.where(near, 1.0, squared))
@@ -21,10 +21,10 @@ def turned(q: Quaternion, turn: Turn) -> Quaternion:
 
 
 def turn_between(q: Quaternion, reference: Quaternion) -> Turn:
-    """:return: the turn that leads from ``reference`` to ``q``, by half a turn at most"""
-    way = _product(reference * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype), normalized(q))
-    way = normalized(jnp.where(way[0] < 0.0, -way, way))
-    w, vector = way[0], way[1:]
+    """:return: the rotation from ``reference`` to ``q``, by pi at most"""
+    relative = _product(reference * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype), normalized(q))
+    relative = normalized(jnp.where(relative[0] < 0.0, -relative, relative))
+    w, vector = relative[0], relative[1:]
     squared = jnp.sum(vector**2)
     near = squared < _SMALL
     sine = jnp.sqrt(jnp.where(near, 1.0, squared))
@@ -32,9 +32,9 @@ def turn_between(q: Quaternion, reference: Quaternion) -> Turn:
 
 
 def turning(q: Quaternion, change: Quaternion) -> Turn:
-    """:return: the turn that a small change of a quaternion of any length makes"""
-    way = _product(q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype), change)
-    return 2.0 * way[1:] / jnp.sum(q**2)
+    """:return: the rotation by a small change of a quaternion of any length"""
+    relative = _product(q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype), change)
+    return 2.0 * relative[1:] / jnp.sum(q**2)
 
 
 def normalized(q: Quaternion) -> Quaternion:
@@ -42,7 +42,7 @@ def normalized(q: Quaternion) -> Quaternion:
 
 
 def _product(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Hamilton's."""
+    """The Hamilton product."""
     (aw, ax, ay, az), (bw, bx, by, bz) = a, b
     return jnp.stack(
         [

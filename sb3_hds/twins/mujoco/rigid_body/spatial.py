@@ -1,7 +1,7 @@
 """
-Spatial vectors: motions, forces, inertias, of all joints or bodies side by side.
+Spatial vectors: motions, forces and inertias of all joints or bodies at once.
 
-Numbers are arrays whose last axis is the joint or the body, or floats where all have the same.
+Numbers are arrays whose last axis is the joint or the body, or floats if all are equal.
 """
 
 from collections.abc import Sequence
@@ -56,7 +56,7 @@ class Body(NamedTuple):
 
 
 def rotation_about(axis: Vector, origin: Vector) -> Motion:
-    """:return: the motion of a body that turns at 1 rad/s about an axis through ``origin``"""
+    """:return: the motion of a body that rotates at 1 rad/s about an axis through ``origin``"""
     return Motion(axis, alg.cross(origin, axis))
 
 
@@ -73,7 +73,7 @@ def cross_force(a: Motion, b: Wrench) -> Wrench:
 
 
 def momentum_of(inertia: Inertia, motion: Motion) -> Wrench:
-    """:return: the momentum of an inertia that moves, or the force that accelerates it"""
+    """:return: the momentum of a moving inertia; for an acceleration, the force"""
     angular, h = motion.angular, inertia.first_moment
     trace = alg.total(inertia.second_moments[:3])
     second = alg.apply(alg.full(inertia.second_moments), angular)
@@ -114,14 +114,14 @@ def coriolis_wrench(coriolis: Coriolis, motion: Motion) -> Wrench:
 
 
 def coriolis_transposed(coriolis: Coriolis, motion: Motion) -> Vector:
-    """The transpose, of whose six numbers the last three are zero."""
+    """The first three numbers of the transpose; the others are zero."""
     back = alg.apply(alg.transpose(coriolis.matrix), motion.angular)
     force = alg.cross(coriolis.momentum, motion.linear)
     return alg.scale(2.0, alg.vadd(force, alg.scale(-1.0, back)))
 
 
 def placed(body: Body, rotation: Matrix, origin: Vector) -> Inertia:
-    """Inertia about the common point, in the axes of the world."""
+    """:return: inertia about the common point, in the axes of the world"""
     centre = alg.vadd(origin, alg.apply(rotation, body.centre))
     first = alg.scale(body.mass, centre)
     own = alg.congruent(rotation, body.second_moments)
@@ -134,7 +134,7 @@ def numbers_of(tree: Any) -> list[Number]:
 
 
 def rebuilt(tree: Any, numbers: list[Number]) -> Any:
-    """The same tuples of tuples with other numbers."""
+    """:return: the same tuples of tuples with other numbers"""
     parts = [rebuilt(part, numbers) if isinstance(part, tuple) else numbers.pop(0) for part in tree]
     return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
 
@@ -150,19 +150,19 @@ def times(factor: Number, tree: Any) -> Any:
 
 
 def side_by_side(trees: Sequence[Any], dtype: Any) -> Any:
-    """Tuples of each joint or body as one tuple of arrays."""
+    """:return: the tuples of all joints or bodies as one tuple of arrays"""
     columns = zip(*map(numbers_of, trees), strict=True)
     return rebuilt(trees[0], [alg.gathered(column, dtype) for column in columns])
 
 
 def repeated(tree: Any, n: int) -> Any:
-    """What all joints or bodies have in common, side by side."""
+    """:return: arrays of ``n`` equal entries"""
     numbers = [x if isinstance(x, float) else jnp.broadcast_to(x, (n,)) for x in numbers_of(tree)]
     return rebuilt(tree, numbers)
 
 
 def sum_over(matrix: np.ndarray, tree: Any) -> Any:
-    """Numbers along the last axis times a matrix."""
+    """:return: each number, as a vector along its last axis, times a matrix"""
     numbers = numbers_of(tree)
     live = [i for i, x in enumerate(numbers) if not isinstance(x, float)]
     numbers = [x if i in live or x == 0.0 else x * matrix.sum(0) for i, x in enumerate(numbers)]
@@ -176,7 +176,7 @@ def sum_over(matrix: np.ndarray, tree: Any) -> Any:
 
 
 def scalar_products(a: Any, b: Any, n: int) -> Number:
-    """Entry ``(i, j)``: the scalar product of number i of ``a`` and number j of ``b``."""
+    """:return: entry ``(i, j)``: the scalar product of joint i of ``a`` and joint j of ``b``"""
     found: Number = 0.0
     for x, y in zip(numbers_of(a), numbers_of(b), strict=True):
         rows = x if isinstance(x, float) else x[..., :, None]

@@ -1,4 +1,4 @@
-"""Forces that no diagnosis names: what is named has to predict better than these do."""
+"""Flexible forces: a cause that a diagnosis names must predict better than these."""
 
 from typing import TYPE_CHECKING
 
@@ -9,16 +9,14 @@ from sb3_hds.core import JointEffect, JointMoment, Memory, Moment, Parameter, Pa
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
 
-# Where springs may begin on both sides, where stops may be on one side, and how far friction may
-# yield: in shares of the excursion.
-_SLACKS, _STOPS, _SLIPS = (
-    (0.1, 0.2, 0.3, 0.45, 0.6),
-    (-0.2, -0.05, 0.1, 0.25, 0.4),
-    (0.03, 0.08, 0.2, 0.4),
-)
-# How suddenly it slides.
-_SHARPNESS = (1.0, 4.0)
-# Of how far it may bend: what is bent less is not bent.
+# Initial values of a search, as shares of the excursion: half clearances, one-sided stops, and the
+# deflections at which friction slides.
+_SLACKS = (0.1, 0.2, 0.3, 0.45, 0.6)
+_STOPS = (-0.2, -0.05, 0.1, 0.25, 0.4)
+_SLIPS = (0.03, 0.08, 0.2, 0.4)
+# Initial values of the exponent of hysteresis.
+_EXPONENTS = (1.0, 4.0)
+# Smallest deflection, as a share of the largest, whose power is computed.
 _TINY = 1e-6
 # An edge that no joint reaches [rad] or [m].
 _NEVER = 1e3
@@ -26,14 +24,14 @@ _NEVER = 1e3
 
 class ClearanceSpring(JointEffect):
     r"""
-    A spring that acts only outside of its clearance: a stop, or a cable that is slack in between.
+    A spring that acts only outside its clearance: a stop, or a cable that is slack in between.
 
     .. math::
         \tau = -\min\!\Big(k,\; \frac{I}{h^2}\Big)
                \Big(\max(q - q_\text{high}, 0) + \min(q - q_\text{low}, 0)\Big)
 
-    The bound is the same as that of :class:`Stiffness`. With both edges at zero it is a spring; an
-    edge that the joint never reaches (a diagnosis takes 1000 rad) leaves a stop on the other side.
+    The bound is that of :class:`Stiffness`. With both edges at zero it is a spring; with one edge
+    that the joint never reaches (a diagnosis takes 1000 rad) it is a stop on the other side.
 
     Source: Shaw and Holmes, *A periodically forced piecewise linear oscillator*, Journal of Sound
     and Vibration 90(1), 1983.
@@ -63,18 +61,18 @@ class ClearanceSpring(JointEffect):
 
 class Hysteresis(JointEffect):
     r"""
-    Dry friction that yields before it slides, as bristles, rolling balls and cables do.
+    Dry friction with elastic deflection before sliding, as of bristles, rolling balls and cables.
 
     .. math::
         \tau = -\min\!\Big(\frac{\tau_c}{s},\; \frac{I}{h^2}\Big)\, z, \qquad
         \dot z = v \Big(1 - \operatorname{sign}(v z) \left|\frac{z}{s}\right|^n\Big)
 
-    with the travel :math:`s` after which it slides. With :math:`n = 1` it yields ever more (Dahl's
-    friction), with large :math:`n` it is a spring until it slides (Prandtl's element). An episode
-    starts with :math:`z = 0`.
+    with the deflection :math:`s` at which it slides. :math:`n = 1` is Dahl's friction; a large
+    :math:`n` is a spring in series with dry friction (Prandtl's element). An episode starts with
+    :math:`z = 0`.
 
     Source: the Bouc-Wen model of Ikhouane and Rodellar, *Systems with Hysteresis*, Wiley 2007,
-    chapter 2, without the part by which it hardens.
+    chapter 2, without its hardening term.
     """
 
     uses_load = False
@@ -89,7 +87,7 @@ class Hysteresis(JointEffect):
     forgets = 2.0
 
     def starts(self, excursion: float, speed: float) -> tuple[dict[str, float], ...]:
-        return tuple({"slip": s * excursion, "n": n} for s in _SLIPS for n in _SHARPNESS)
+        return tuple({"slip": s * excursion, "n": n} for s in _SLIPS for n in _EXPONENTS)
 
     def memory(self, twin: "Twin") -> Memory:
         return jnp.zeros(())
@@ -99,7 +97,7 @@ class Hysteresis(JointEffect):
         return -stiffness * memory
 
     def advance(self, moment: Moment, index: int, memory: Memory, params: Params) -> Memory:
-        way, slip = moment.h * moment.v[index], params["slip"]
+        change, slip = moment.h * moment.v[index], params["slip"]
         bent = jnp.maximum(jnp.abs(memory) / slip, _TINY) ** params["n"]
-        after = memory + way * (1.0 - jnp.sign(way * memory) * bent)
+        after = memory + change * (1.0 - jnp.sign(change * memory) * bent)
         return jnp.clip(after, -slip, slip)

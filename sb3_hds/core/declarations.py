@@ -1,8 +1,8 @@
-"""A physical constant that can be estimated from data."""
+"""What a twin declares: joints, actuators, observation channels and physical parameters."""
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from sb3_hds.errors import ParameterError
 
@@ -17,6 +17,54 @@ _PRISMATIC_UNIT = {
 }
 
 
+class Joint(NamedTuple):
+    """
+    One degree of freedom.
+
+    :param name: unique within the twin
+    :param unit: unit of its position: ``"rad"`` for a hinge, ``"m"`` for a slider
+    :param low: position of the lower end stop, which the twin does not simulate
+    :param high: position of the upper end stop
+    """
+
+    name: str
+    unit: str = "rad"
+    low: float = float("-inf")
+    high: float = float("inf")
+
+
+class Actuator(NamedTuple):
+    """
+    One command.
+
+    :param name: unique within the twin
+    :param unit: unit of the command
+    :param low: smallest command that the environment accepts
+    :param high: largest command that the environment accepts
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+class Channel(NamedTuple):
+    """
+    One entry of the observation.
+
+    :param name: unique within the twin
+    :param unit: unit of the measurement
+    :param low: smallest value that the observation space declares
+    :param high: largest value that the observation space declares
+    """
+
+    name: str
+    unit: str
+    low: float = float("-inf")
+    high: float = float("inf")
+
+
 @dataclasses.dataclass(frozen=True)
 class Parameter:
     """
@@ -24,7 +72,7 @@ class Parameter:
 
     :param null: nominal value; for an effect, the value at which it vanishes
     :param scale: typical deviation from ``null``, in the same unit; must be positive
-    :param unit: SI unit, for example ``"N m s/rad"``; ``"1"`` where there is none
+    :param unit: SI unit, for example ``"N m s/rad"``; ``"1"`` if dimensionless
     :param lower: smallest admissible value
     :param upper: largest admissible value
     :raises ParameterError: if ``scale`` is not positive or ``null`` lies outside the bounds
@@ -66,5 +114,5 @@ class Parameter:
         return value
 
     def prismatic(self) -> "Parameter":
-        """:return: the same parameter with the unit that it has at a sliding joint"""
+        """:return: the same parameter with its unit at a sliding joint"""
         return dataclasses.replace(self, unit=_PRISMATIC_UNIT.get(self.unit, self.unit))
