@@ -113,7 +113,7 @@ class Problem:
 
 def simulate(problem: Problem, start: State, controls: Controls) -> Plan:
     """Roll out a control sequence and score it."""
-    return _roll(problem, start, lambda state, control: control, controls, controls.shape[0])
+    return roll_out(problem, start, lambda _, control: control, controls, controls.shape[0])
 
 
 def simulated(problem: Problem, start: State, first: Controls | Plan) -> Plan:
@@ -132,10 +132,16 @@ def follow(problem: Problem, start: State, policy: Callable[[Obs], Control], n_s
     def decide(state: State, _: None) -> Control:
         return jnp.clip(policy(problem.observe(state)), -1.0, 1.0)
 
-    return _roll(problem, start, decide, None, n_steps)
+    return roll_out(problem, start, decide, None, n_steps)
 
 
-def _roll(problem: Problem, start: State, decide: Callable, inputs: Any, length: int) -> Plan:
+def roll_out(problem: Problem, start: State, decide: Callable, inputs: Any, length: int) -> Plan:
+    """
+    :param decide: maps a state and its slice of ``inputs`` to a control in [-1, 1]
+    :param inputs: pytree whose leaves have a leading axis of ``length``; None: no inputs
+    :return: the simulated and scored plan of these decisions
+    """
+
     def advance(carry: tuple[State, Flag], given: Any):
         state, alive = carry
         control = decide(state, given)
