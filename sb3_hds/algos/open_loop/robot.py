@@ -34,25 +34,25 @@ class Robot:
     :param control: ``"track"``: actuators follow joint positions; ``"direct"``: oscillators are the
         commands
     :param names: of the actuated joints, in the order of the actuators
-    :param position: of each in ``qpos`` followed by ``qvel``; empty where nothing is tracked
-    :param velocity: of each in ``qpos`` followed by ``qvel``
-    :param seen_position: of each in the observation; empty if that does not have them all
-    :param seen_velocity: of each in the observation
-    :param lower: ends of their ranges, or of the commands
-    :param upper: the other ends
-    :param rest: where the model puts them at first, or the middle of the commands
+    :param lower: lower limit of each joint, or of each command
+    :param upper: upper limits
+    :param rest: positions at rest in the model, or the middle of each command's range
+    :param position: index of each position in ``qpos`` followed by ``qvel``; empty without tracking
+    :param velocity: index of each velocity in ``qpos`` followed by ``qvel``
+    :param seen_position: index of each position in the observation; empty unless all are observed
+    :param seen_velocity: index of each velocity in the observation
     """
 
     dt: float
     control: str
     names: tuple[str, ...]
-    position: tuple[int, ...]
-    velocity: tuple[int, ...]
-    seen_position: tuple[int, ...]
-    seen_velocity: tuple[int, ...]
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     rest: tuple[float, ...]
+    position: tuple[int, ...] = ()
+    velocity: tuple[int, ...] = ()
+    seen_position: tuple[int, ...] = ()
+    seen_velocity: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # JSON has lists only
@@ -102,10 +102,6 @@ def robot_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Robot:
             dt=interval,
             control="direct",
             names=tuple(f"action[{i}]" for i in range(low.size)),
-            position=(),
-            velocity=(),
-            seen_position=(),
-            seen_velocity=(),
             lower=tuple(low.tolist()),
             upper=tuple(high.tolist()),
             rest=tuple((0.5 * (low + high)).tolist()),

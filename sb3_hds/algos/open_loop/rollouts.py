@@ -129,7 +129,8 @@ class Trials:
         model.num_timesteps += self._env.num_envs
         callback.update_locals(locals())
         going = callback.on_step()
-        model._last_obs = _owned(new_obs)  # type: ignore[assignment]
+        # Some environments step into the array that they returned before.
+        model._last_obs = new_obs.copy() if isinstance(new_obs, np.ndarray) else new_obs  # type: ignore[assignment]
         model._update_info_buffer(infos, dones)
         total = model._total_timesteps
         model._update_current_progress_remaining(model.num_timesteps, total)
@@ -156,8 +157,3 @@ def _forget_episode(env: Any, copy: int) -> None:
         elif isinstance(env, VecNormalize):
             env.returns[copy] = 0.0
         env = env.venv
-
-
-def _owned(observation: Any) -> Any:
-    """Some environments step into the array that they returned before."""
-    return observation.copy() if isinstance(observation, np.ndarray) else observation
