@@ -13,13 +13,13 @@ from gymnasium import spaces
 from small_models import small
 
 from sb3_hds.algos.model_free.sac import update as off_policy
-from sb3_hds.algos.model_free.sac.objectives import (
+from sb3_hds.algos.model_free.sac.networks import Dropout
+from sb3_hds.algos.model_free.sac.tqc import (
     all_targets,
     sorted_by_columns,
     sorted_by_rows,
     target_by_target,
 )
-from sb3_hds.algos.nets.mlp import Dropout
 from sb3_hds.algos.nets.observations import flattener
 from sb3_hds.algos.nets.options import TrainState, optimizer_of
 

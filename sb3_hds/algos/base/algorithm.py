@@ -25,9 +25,10 @@ from sb3_hds.algos.base.construct import (
     check_origin,
     check_policy_kwargs,
 )
-from sb3_hds.algos.base.files import by_names, damaged, write_whole
+from sb3_hds.algos.base.files import damaged, write_whole
 from sb3_hds.algos.base.policy import TensorPolicy
 from sb3_hds.algos.base.saving import SavesTensors
+from sb3_hds.algos.nets.options import by_names
 from sb3_hds.errors import EnvironmentMismatchError
 
 # Steps per second below which a learner says what would make it faster.
@@ -161,10 +162,13 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         progress_bar: bool = False,
     ) -> Self:
         """
-        Act in the environment and learn from it.
+        Act in the environment and learn from it, PODS and HDS after their pretraining in the twin.
 
-        :param total_timesteps: steps of the *environment*; default ``default_timesteps``
-        :param callback: called at every step of the environment
+        :param total_timesteps: steps of the *environment*; default ``default_timesteps``. With 0,
+            PODS and HDS run their pretraining only.
+        :param callback: called at every step of the environment; with PODS and HDS also after every
+            planning epoch of the pretraining, with ``locals["pretraining"]`` and no timestep
+            counted
         :param log_interval: episodes between two log lines
         :param tb_log_name: name of the run for TensorBoard; default: the class's name
         :param reset_num_timesteps: False goes on counting

@@ -16,7 +16,7 @@ import os
 import pickle
 import secrets
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import torch as th
-
-from sb3_hds.algos.nets.options import activation_name, optimizer_name
 
 
 def write_whole(
@@ -176,24 +174,6 @@ def from_state_dict(tree: Any, tensors: dict[str, th.Tensor], strict: bool = Tru
         value = tensors[name].cpu().numpy() if name in tensors else leaf
         values.append(_where(leaf, value))
     return jax.tree_util.tree_unflatten(structure, values)
-
-
-def by_names(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Files hold arguments, too, and a function of JAX is pickled by parts of JAX that change.
-
-    :return: the same, with the names of activations and optimisers where their functions were
-        given, and lists where arrays were, whose truth SB3 asks for
-    """
-    named = dict(policy_kwargs)
-    for argument, value in policy_kwargs.items():
-        if isinstance(value, np.ndarray):
-            named[argument] = value.tolist()
-        elif argument.endswith("activation_fn"):
-            named[argument] = activation_name(value)
-        elif argument == "optimizer_class":
-            named[argument] = optimizer_name(value)
-    return named
 
 
 def _remove(file: Path) -> None:

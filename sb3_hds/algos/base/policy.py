@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import jax
@@ -16,13 +16,13 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import get_device, is_vectorized_observation
 
 from sb3_hds.algos.base.files import (
-    by_names,
     damage_reported,
     from_state_dict,
     refuse_damaged,
     to_state_dict,
 )
-from sb3_hds.algos.nets.options import TrainState
+from sb3_hds.algos.nets.observations import flattener, size_of
+from sb3_hds.algos.nets.options import TrainState, by_names, widths
 from sb3_hds.core.numerics.compilation import GENERATOR
 
 
@@ -217,8 +217,15 @@ class LearningPolicy(TensorPolicy):
     #: observations to rows of numbers
     flatten: Callable[[Any], np.ndarray]
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(self, config: Any) -> None:
+        """:param config: a :class:`PolicyConfig` with a ``net_arch``"""
+        super().__init__(config.observation_space, config.action_space, squash_output=True)
+        self.arguments, net = config.arguments(), config.net_arch
+        self.arguments["net_arch"] = dict(net) if isinstance(net, Mapping) else net
+        self.widths = widths(net, "qf")
+        self.n_obs = size_of(config.observation_space)
+        self.n_act = int(np.prod(config.action_space.shape))
+        self.flatten = flattener(config.observation_space)
         self._agent_state: Any = None
         self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
 

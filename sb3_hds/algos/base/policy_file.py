@@ -21,7 +21,7 @@ from gymnasium import spaces
 from sb3_hds.algos import registry
 from sb3_hds.algos.base.files import damaged, existing, name_of, refuse_damaged
 from sb3_hds.algos.base.policy import TensorPolicy
-from sb3_hds.algos.nets.options import activation, activation_name
+from sb3_hds.algos.nets.options import ACTIVATIONS, activation, name_in
 
 # Arguments of policies that prediction does not need: they say how to learn.
 _OF_LEARNING = ("lr_schedule", "optimizer_class", "optimizer_kwargs", "qf_optimizer_kwargs")
@@ -36,7 +36,7 @@ def described(policy: TensorPolicy) -> dict[str, Any] | None:
     if name is None:
         return None
     arguments = {
-        name: activation_name(activation(value)) if name.endswith("activation_fn") else value
+        name: name_in(ACTIVATIONS, activation(value)) if name.endswith("activation_fn") else value
         for name, value in policy.arguments.items()
         if name not in _OF_LEARNING
     }

@@ -25,8 +25,9 @@ from sb3_hds.algos.base.construct import (
     policy_and_env,
     whole_steps,
 )
-from sb3_hds.algos.base.files import by_names, damage_reported, name_of, refuse_damaged, write_whole
+from sb3_hds.algos.base.files import damage_reported, name_of, refuse_damaged, write_whole
 from sb3_hds.algos.base.policy_file import described
+from sb3_hds.algos.nets.options import by_names
 from sb3_hds.core.numerics.kept_programs import keep_programs
 from sb3_hds.errors import EnvironmentMismatchError
 

@@ -126,6 +126,8 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     #: steps of ``learn()`` without a number
     default_timesteps: ClassVar[int] = 20_000
     policy: LearningPolicy
+    #: fields of the policy's state that ``param_resets`` leaves unchanged
+    kept_by_restarts: Any
     qf_learning_rate: Any
     policy_delay: int
     #: the replay buffer that arguments led to, where none was passed
@@ -165,9 +167,12 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     def _build(self, seed: int) -> None:
         """Draw fresh networks."""
 
-    @abstractmethod
     def _restart(self, seed: int) -> None:
-        """Draw fresh networks, and keep what is no network."""
+        """Draw fresh networks; the fields in ``kept_by_restarts`` stay."""
+        before = self.policy.agent_state
+        kept = {name: getattr(before, name) for name in self.kept_by_restarts}
+        self._build(seed)
+        self.policy.agent_state = self.policy.agent_state._replace(**kept)
 
     @abstractmethod
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
@@ -185,7 +190,10 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         :raises DivergedError: if one of them diverged; the model keeps its last good state
         :raises ValueError: if there is nothing to learn from
         """
-        self._maybe_reset_params()
+        resets = self.param_resets or []
+        if self.reset_idx < len(resets) and self.num_timesteps >= resets[self.reset_idx]:
+            self.reset_idx += 1
+            self._restart(self.network_seed)
         rate, qf_rate = self.learning_rates()
         if gradient_steps > 0 and self.replay_buffer.size() == 0:  # type: ignore[union-attr]
             raise ValueError(
@@ -363,12 +371,6 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     def _usual_buffer(self) -> type[ReplayBuffer] | None:
         """:return: what is used where none is passed; None: what SB3 uses"""
         return None
-
-    def _maybe_reset_params(self) -> None:
-        resets = self.param_resets or []
-        if self.reset_idx < len(resets) and self.num_timesteps >= resets[self.reset_idx]:
-            self.reset_idx += 1
-            self._restart(self.network_seed)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic", "_before"]

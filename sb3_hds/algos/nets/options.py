@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,45 +13,22 @@ import torch as th
 from torch.nn import functional
 
 Activation = Callable[[jax.Array], jax.Array]
+_NAMES = (
+    *("tanh", "relu", "elu", "gelu", "gelu_exact", "silu", "leaky_relu", "softplus", "celu"),
+    *("selu", "mish", "relu6", "sigmoid", "log_sigmoid", "hard_sigmoid", "hard_swish"),
+    *("hard_tanh", "soft_sign"),
+)
+_GELU_EXACT = partial(jax.nn.gelu, approximate=False)
 ACTIVATIONS: dict[str, Activation] = {
-    "tanh": nn.tanh,
-    "relu": nn.relu,
-    "elu": nn.elu,
-    "gelu": nn.gelu,
-    "gelu_exact": partial(nn.gelu, approximate=False),
-    "silu": nn.silu,
-    "leaky_relu": nn.leaky_relu,
-    "softplus": nn.softplus,
-    "celu": jax.nn.celu,
-    "selu": jax.nn.selu,
-    "mish": jax.nn.mish,
-    "relu6": jax.nn.relu6,
-    "sigmoid": jax.nn.sigmoid,
-    "log_sigmoid": jax.nn.log_sigmoid,
-    "hard_sigmoid": jax.nn.hard_sigmoid,
-    "hard_swish": jax.nn.hard_swish,
-    "hard_tanh": jax.nn.hard_tanh,
-    "soft_sign": jax.nn.soft_sign,
+    name: _GELU_EXACT if name == "gelu_exact" else getattr(jax.nn, name) for name in _NAMES
 }
+# Torch's classes have these names without underscores, and its GELU is the exact one.
+_BY_LETTERS = {name.replace("_", ""): name for name in ACTIVATIONS}
 _TORCH_MODULES: dict[type, str] = {
-    th.nn.Tanh: "tanh",
-    th.nn.ReLU: "relu",
-    th.nn.ELU: "elu",
-    th.nn.GELU: "gelu_exact",
-    th.nn.SiLU: "silu",
-    th.nn.LeakyReLU: "leaky_relu",
-    th.nn.Softplus: "softplus",
-    th.nn.CELU: "celu",
-    th.nn.SELU: "selu",
-    th.nn.Mish: "mish",
-    th.nn.ReLU6: "relu6",
-    th.nn.Sigmoid: "sigmoid",
-    th.nn.LogSigmoid: "log_sigmoid",
-    th.nn.Hardsigmoid: "hard_sigmoid",
-    th.nn.Hardswish: "hard_swish",
-    th.nn.Hardtanh: "hard_tanh",
-    th.nn.Softsign: "soft_sign",
-}
+    kind: _BY_LETTERS[kind.__name__.lower()]
+    for kind in vars(th.nn).values()
+    if isinstance(kind, type) and kind.__name__.lower() in _BY_LETTERS
+} | {th.nn.GELU: "gelu_exact"}
 # Functions of the same names, of which torch has some twice; the first entry counts.
 _OF_TORCH: list[tuple[Any, str]] = [
     *_TORCH_MODULES.items(),
@@ -67,17 +43,11 @@ _OF_TORCH: list[tuple[Any, str]] = [
 ]
 Weights = Mapping[str, Any]
 OPTIMIZERS = {
-    "adam": optax.adam,
-    "adamw": optax.adamw,
-    "sgd": optax.sgd,
-    "rmsprop": optax.rmsprop,
-    "nadam": optax.nadam,
-    "radam": optax.radam,
-    "adabelief": optax.adabelief,
-    "lion": optax.lion,
-    "adamax": optax.adamax,
-    "adadelta": optax.adadelta,
-    "adagrad": optax.adagrad,
+    name: getattr(optax, name)
+    for name in (
+        *("adam", "adamw", "sgd", "rmsprop", "nadam", "radam"),
+        *("adabelief", "lion", "adamax", "adadelta", "adagrad"),
+    )
 }
 # Of torch's classes: where their defaults are not those of optax. NAdam's momentum has a schedule
 # that optax does not have.
@@ -102,10 +72,9 @@ def activation(choice: str | Activation | type) -> Activation:
         that JAX cannot trace, or that changes the shape of what it is given
     """
     name = choice if isinstance(choice, str) else _torch_name(choice)
-    known = {key.replace("_", ""): function for key, function in ACTIVATIONS.items()}
-    found = known.get(name.lower().replace("_", ""))
-    if found is not None:
-        return found
+    letters = name.lower().replace("_", "")
+    if letters in _BY_LETTERS:
+        return ACTIVATIONS[_BY_LETTERS[letters]]
     if isinstance(choice, str | type | th.nn.Module) or not callable(choice):
         raise ValueError(
             f"activation_fn must be one of {', '.join(ACTIVATIONS)}, a torch class of such a name, "
@@ -114,10 +83,27 @@ def activation(choice: str | Activation | type) -> Activation:
     return _checked(choice)
 
 
-def activation_name(choice: Any) -> Any:
-    """:return: of a function that is known here, its name; anything else as it is"""
-    names = (name for name, known in ACTIVATIONS.items() if known is choice)
-    return next(names, choice)
+def name_in(table: Mapping[str, Any], choice: Any) -> Any:
+    """:return: the name of a function that the table has; anything else unchanged"""
+    return next((name for name, known in table.items() if known is choice), choice)
+
+
+def by_names(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Replace functions of JAX, which would be pickled by parts of JAX that change, by their names.
+
+    :return: the same arguments with names of activations and optimisers where their functions were
+        given, and lists in place of arrays, whose truth value SB3 evaluates
+    """
+    named = dict(policy_kwargs)
+    for argument, value in policy_kwargs.items():
+        if isinstance(value, np.ndarray):
+            named[argument] = value.tolist()
+        elif argument.endswith("activation_fn"):
+            named[argument] = name_in(ACTIVATIONS, value)
+        elif argument == "optimizer_class":
+            named[argument] = name_in(OPTIMIZERS, value)
+    return named
 
 
 def _checked(function: Activation) -> Activation:
@@ -147,7 +133,7 @@ def _torch_name(choice: Any) -> str:
     return next((name for ours, name in _OF_TORCH if ours is choice), "")
 
 
-def widths_of(given: Any) -> tuple[int, ...] | None:
+def _widths_of(given: Any) -> tuple[int, ...] | None:
     """:return: widths of layers as Python has them; None unless all are whole numbers above 0"""
     if isinstance(given, np.ndarray):
         given = given.tolist()
@@ -159,15 +145,20 @@ def widths_of(given: Any) -> tuple[int, ...] | None:
 
 
 def widths(
-    net_arch: Sequence[int] | Mapping[str, Sequence[int]], critic: str
+    net_arch: Sequence[int] | Mapping[str, Sequence[int]] | None,
+    critic: str,
+    defaults: Mapping[str, Sequence[int]] | None = None,
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """
     :param critic: the key of the critics' widths, where those of the actor differ
+    :param defaults: by key, for keys that are missing or None; None: both keys are required
     :return: hidden widths of the actor and of the critics
     :raises ValueError: for other keys than ``pi`` and that one, or widths that are no counts
     """
     given = net_arch if isinstance(net_arch, Mapping) else {"pi": net_arch, critic: net_arch}
-    pi, qf = (widths_of(given.get(name)) for name in ("pi", critic))
+    if defaults is not None:
+        given = {**defaults, **{name: each for name, each in given.items() if each is not None}}
+    pi, qf = (_widths_of(given.get(name)) for name in ("pi", critic))
     if given.keys() != {"pi", critic} or pi is None or qf is None:
         raise ValueError(
             f"net_arch must be a list of widths such as [256, 256], or {{'pi': [256], '{critic}': "
@@ -253,8 +244,3 @@ def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -
     except TypeError as error:
         raise ValueError(f"optimizer_kwargs {arguments!r} do not fit {name}: {error}.") from None
     return optimizer
-
-
-def optimizer_name(choice: Any) -> Any:
-    """:return: of a function of optax that is known here, its name; anything else as it is"""
-    return next((name for name, known in OPTIMIZERS.items() if known is choice), choice)

@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 
 from sb3_hds.algos.base.algorithm import TensorAlgorithm
 from sb3_hds.algos.base.construct import callbacks_of, jax_device
-from sb3_hds.algos.twin.config import TwinConfig, epoch_config, hyperparams
+from sb3_hds.algos.twin.config import TwinConfig, epoch_config
 from sb3_hds.algos.twin.epoch import EpochMetrics, epoch, epoch_log, programs, twin_steps_per_epoch
 from sb3_hds.algos.twin.model import (
     Tensors,
@@ -45,6 +45,7 @@ from sb3_hds.algos.twin.regression import (
 from sb3_hds.algos.twin.state import (
     EpochConfig,
     EpochState,
+    Hyperparams,
     Workspace,
     init_workspace,
     longest_episode,
@@ -59,6 +60,8 @@ from sb3_hds.errors import DivergedError
 # end early.
 _RECENT = 0.9
 _FEWEST_EPOCHS = 20
+# Factor on the temperature of the annealed acceptance after each epoch: below 1 % after fifty.
+_TEMPERATURE_DECAY = 0.9
 
 
 class TwinAlgorithm(TensorAlgorithm):
@@ -102,31 +105,6 @@ class TwinAlgorithm(TensorAlgorithm):
         self.stopped = False
         self.poll: Callable[[], None] = nothing
 
-    def learn(  # type: ignore[override]
-        self,
-        total_timesteps: int | None = None,
-        callback: MaybeCallback = None,
-        log_interval: int | None = 4,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> Self:
-        """
-        Plan in the twin until the pretraining is done, then act in the environment and plan on.
-
-        :param total_timesteps: steps of the *environment*; default ``default_timesteps``. With 0,
-            only the pretraining runs, and the environment is not stepped.
-        :param callback: called at every step of the environment, and before the first one after
-            every planning epoch, with ``locals["pretraining"]`` and no timestep counted
-        :param log_interval: episodes between two log lines
-        :param tb_log_name: name of the run for TensorBoard; default: the class's name
-        :param reset_num_timesteps: False goes on counting
-        :param progress_bar: show one for planning and one for acting
-        """
-        return super().learn(
-            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
-        )
-
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """One planning epoch with ``gradient_steps`` regression steps, between real steps."""
         self._n_updates += gradient_steps
@@ -160,14 +138,10 @@ class TwinAlgorithm(TensorAlgorithm):
         :raises NoTwinError: if the model was loaded without environment and without twin
         :raises DivergedError: if the regression diverged; the model keeps its last good state
         """
-        state, program, config = self._epoch_state(), self._program, self.config
-        every, view = config.refinements.compare_every, self._view(program.twin)
-        rate = self.lr_schedule(self._progress_remaining())
+        state, program = self._epoch_state(), self._program
+        every = self.config.refinements.compare_every
         n_epochs = int(self.policy.progress.n_epochs)
-        varied = self.varied(program.twin)
-        hyper = hyperparams(
-            config, n_epochs, rate, gradient_steps, program.twin.params, varied, view
-        )
+        hyper = self.hyperparams(program.twin, gradient_steps)
         if program != self._compiled:
             meanwhile(programs(program, state, hyper), self.poll)
             self._compiled, self._comparison = program, None
@@ -199,6 +173,24 @@ class TwinAlgorithm(TensorAlgorithm):
         self.logger.record("time/epochs", int(self.policy.progress.n_epochs))
         self.logger.record("time/twin_timesteps", self.twin_timesteps)
         return metrics
+
+    def hyperparams(self, twin: Twin, gradient_steps: int) -> Hyperparams:
+        """:return: what the next epoch works with, without compiling again"""
+        config, n_epochs = self.config, int(self.policy.progress.n_epochs)
+        how = config.refinements
+        return Hyperparams(
+            params=twin.params,
+            varied=self.varied(twin),
+            learning_rate=self.lr_schedule(self._progress_remaining()),
+            noise=config.exploration_noise * config.exploration_decay**n_epochs,
+            temperature=config.temperature * _TEMPERATURE_DECAY**n_epochs,
+            reset_share=config.reset_share,
+            gain_weight=how.gain_weight,
+            sensitivity_weight=how.sensitivity_weight,
+            averaging=how.averaging,
+            gradient_steps=gradient_steps,
+            view=self._view(twin),
+        )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
@@ -352,8 +344,8 @@ class TwinAlgorithm(TensorAlgorithm):
         """
         planned = self.pretraining_due
         steps = self.gradient_steps if self.gradient_steps >= 0 else self._steps_per_epoch
-        metrics = self.run_epoch(steps)
-        before, after = float(metrics.before), float(metrics.after)
+        plans = self.run_epoch(steps).plans
+        before, after = float(plans.before), float(plans.after)
         self.recent_gain = _RECENT * self.recent_gain + max(0.0, after - before)
         self.recent_return = _RECENT * self.recent_return + abs(before)
         self.n_pretrained += 1

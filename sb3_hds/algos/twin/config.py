@@ -9,8 +9,8 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_hds.algos.base.config import OffPolicyConfig, Rate, between
 from sb3_hds.algos.twin.policy import TwinPolicy
-from sb3_hds.algos.twin.state import EpochConfig, Hyperparams, View
-from sb3_hds.core import Params, Twin
+from sb3_hds.algos.twin.state import EpochConfig
+from sb3_hds.core import Twin
 
 PLANNERS = ("first_order", "gauss_newton", "ilqr")
 LOSSES = ("smooth_absolute", "squared")
@@ -23,9 +23,6 @@ _LOOKAHEAD = 5
 # Share of start states for which random plans are tried: they are as expensive as the policy's own,
 # and a local optimum that half of the rollouts avoid is no longer what the policy learns.
 _RANDOM_SHARE = 0.5
-# Factor on the temperature of the annealed acceptance after each epoch: after the first fifty, it
-# is below 1 % of what it was.
-_TEMPERATURE_DECAY = 0.9
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -207,37 +204,4 @@ def epoch_config(config: TwinConfig, policy: TwinPolicy, twin: Twin) -> EpochCon
         max_grad_norm=policy.max_grad_norm,
         annealed=config.temperature > 0.0,
         adapt_scales=how.adapt_scales,
-    )
-
-
-def hyperparams(
-    config: TwinConfig,
-    n_epochs: int,
-    learning_rate: float,
-    gradient_steps: int,
-    params: Params,
-    varied: Params,
-    view: View,
-) -> Hyperparams:
-    """
-    :param n_epochs: that were done
-    :param learning_rate: of this epoch
-    :param params: the twin's parameters
-    :param varied: those of them that differ between rollouts, each of shape ``(n_rollouts,)``
-    :param view: what the environment's own normalisation does to an observation
-    :return: what this epoch works with, without compiling again
-    """
-    how = config.refinements
-    return Hyperparams(
-        params=params,
-        varied=varied,
-        learning_rate=learning_rate,
-        noise=config.exploration_noise * config.exploration_decay**n_epochs,
-        temperature=config.temperature * _TEMPERATURE_DECAY**n_epochs,
-        reset_share=config.reset_share,
-        gain_weight=how.gain_weight,
-        sensitivity_weight=how.sensitivity_weight,
-        averaging=how.averaging,
-        gradient_steps=gradient_steps,
-        view=view,
     )

@@ -67,17 +67,15 @@ class Outcome(NamedTuple):
 
 class EpochMetrics(NamedTuple):
     """
-    What an epoch tells: its :class:`Outcome`, and
+    What an epoch logs.
 
-    :param policy_loss: mean regression loss of the epoch
+    :param plans: what came of planning
+    :param policy_loss: mean regression loss of the policy
     :param value_loss: mean regression loss of the value
     :param gradient_norm: mean norm of the policy's gradient before it is clipped
     """
 
-    before: jax.Array
-    after: jax.Array
-    worsened: jax.Array
-    dropped: jax.Array
+    plans: Outcome
     policy_loss: jax.Array
     value_loss: jax.Array
     gradient_norm: jax.Array
@@ -109,10 +107,7 @@ def epoch(
     """
     state, outcome = plan_ahead(config, state, hyper)
     state, losses = learn_from_plans(config, state, hyper)
-    of_policy, of_value, norm = losses
-    return state, EpochMetrics(
-        *outcome, policy_loss=of_policy, value_loss=of_value, gradient_norm=norm
-    )
+    return state, EpochMetrics(outcome, *losses)
 
 
 def epoch_log(
@@ -128,13 +123,13 @@ def epoch_log(
         compared["train/return_of_best"] = float(max(returns))
     return compared | {
         "train/learning_rate": hyper.learning_rate,
-        "train/plan_return_before": float(metrics.before),
-        "train/plan_return_after": float(metrics.after),
+        "train/plan_return_before": float(metrics.plans.before),
+        "train/plan_return_after": float(metrics.plans.after),
         "train/policy_loss": float(metrics.policy_loss),
         "train/value_loss": float(metrics.value_loss),
         "train/gradient_norm": float(metrics.gradient_norm),
-        "train/worsened_plans": int(metrics.worsened),
-        "train/dropped_samples": int(metrics.dropped),
+        "train/worsened_plans": int(metrics.plans.worsened),
+        "train/dropped_samples": int(metrics.plans.dropped),
         "train/exploration_noise": hyper.noise,
         "train/temperature": hyper.temperature,
     }

@@ -1,7 +1,7 @@
 """The twin that an algorithm plans in: which, whether it can, and how observations are scaled."""
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -111,14 +111,6 @@ def missing_effects(twin: Twin, wanted: Sequence[str | dict[str, Any]]) -> list[
             options = entry.get("options", {})
             found.append(effect(entry["where"], **options, **entry["parameters"]))
     return [effect for effect in found if not _has(twin, effect)]
-
-
-def check_known(names: Iterable[str]) -> None:
-    """
-    :raises EffectError: for a name that is not in the catalogue
-    """
-    for name in names:
-        effects.effect_named(name, effects.KNOWN)
 
 
 def nulls_of(attached: Sequence[Effect]) -> dict[str, float]:

@@ -12,13 +12,13 @@ from gymnasium import spaces
 
 from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.base.policy import PolicyConfig, TensorPolicy, TrainingTensors
-from sb3_hds.algos.nets.options import Activation, activation, finite_leaves, widths_of
+from sb3_hds.algos.nets.options import Activation, activation, finite_leaves, widths
 from sb3_hds.algos.twin.networks import Actor, Value
 from sb3_hds.algos.twin.state import Networks, Progress, fresh_networks
 from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.deploy.policy_function import PolicyFunction
 
-_POLICY_WIDTHS, _VALUE_WIDTHS = (96, 96), (64, 64)
+_WIDTHS = {"pi": (96, 96), "vf": (64, 64)}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class TwinPolicy(TensorPolicy):
         super().__init__(config.observation_space, config.action_space, squash_output=True)
         self.arguments = config.arguments()
         del self.arguments["use_sde"]
-        pi, vf = _widths(config.net_arch)
+        pi, vf = widths(config.net_arch, "vf", _WIDTHS)
         function, n_act = activation(config.activation_fn), int(np.prod(config.action_space.shape))
         self.actor_network = Actor(n_act, pi, function, config.linear_path)
         self.value_network = Value(vf, function)
@@ -134,22 +134,3 @@ def _act(actor: Actor, networks: Networks, obs: Any) -> Any:
 def all_finite(networks: Networks) -> bool:
     """:return: whether no weight is infinite or not a number"""
     return finite_leaves((networks.actor, networks.average, networks.value, networks.acting))
-
-
-def _widths(
-    net_arch: Sequence[int] | dict[str, Sequence[int]] | None,
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """
-    :return: hidden widths of the policy and of the value
-    :raises ValueError: for other keys than ``pi`` and ``vf``, or widths that are no counts
-    """
-    given = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "vf": net_arch}
-    usual = {"pi": _POLICY_WIDTHS, "vf": _VALUE_WIDTHS}
-    widths = usual | {name: some for name, some in given.items() if some is not None}
-    pi, vf = (widths_of(widths[name]) for name in usual)
-    if widths.keys() != usual.keys() or pi is None or vf is None:
-        raise ValueError(
-            "net_arch must be a list of widths such as [64, 64], or {'pi': [64, 64], 'vf': [64]}, "
-            f"got {net_arch!r}."
-        )
-    return pi, vf

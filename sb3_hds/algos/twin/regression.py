@@ -127,11 +127,10 @@ def rescale(state: EpochState, samples: Samples) -> EpochState:
     )
 
 
-def regress_policy(
-    config: EpochConfig, state: EpochState, hyper: Hyperparams, key: PRNGKeyArray
-) -> tuple[Mapping[str, Any], Any, Float[Array, " 2"]]:
+@partial(jax.jit, static_argnums=0)
+def learn_policy(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
     r"""
-    Adam on minibatches of the remembered samples.
+    Regress the policy on the remembered samples: Adam on minibatches.
 
     The policy learns from the first steps of each plan only: what a plan does towards its end
     depends on the value found there.
@@ -140,9 +139,9 @@ def regress_policy(
     scale: a squared error averages between turning left and turning right, and blurs the moments
     of switching. The paper's :math:`w\,e^2/2`, in units of the control, is a setting.
 
-    :param key: that of :func:`regress_value`, too: both draw from it, and not the same
-    :return: the policy's parameters and the state of Adam; the mean loss, and the mean norm of the
-        gradient before it is clipped
+    :return: the policy's parameters, their moving average and the state of Adam; the mean loss, and
+        the mean norm of the gradient before it is clipped; the number of epochs and the random key
+        after this one
     """
     inside, unit = state.networks.inside, state.progress.control_scale
 
@@ -152,23 +151,31 @@ def regress_policy(
             return jnp.mean(batch.weight[:, None] * 0.5 * error**2)
         return jnp.mean(batch.weight[:, None] * jnp.sqrt((error / unit) ** 2 + _SMOOTH_ERROR**2))
 
+    nets, progress = state.networks, state.progress
+    key, k_regress = _next_keys(state)
+    # The value draws from the same key, but other numbers.
+    keys = lambda i: jax.random.split(jax.random.fold_in(k_regress, i))[0]  # noqa: E731
     n_early = config.n_learned * config.n_rollouts
-    begin = state.networks.actor, state.progress.actor_optimizer
-    keys = lambda i: jax.random.split(jax.random.fold_in(key, i))[0]  # noqa: E731
-    return _descent(config, state, hyper, loss, n_early, keys, *begin)
+    begin = nets.actor, progress.actor_optimizer
+    actor, optimizer, (mean_loss, norm) = _descent(
+        config, state, hyper, loss, n_early, keys, *begin
+    )
+    decay = jnp.where(progress.n_epochs > 0, hyper.averaging, 0.0)
+    average = jax.tree.map(lambda a, new: decay * a + (1.0 - decay) * new, nets.average, actor)
+    after = progress.n_epochs + 1, jax.random.key_data(key)
+    return actor, average, optimizer, mean_loss, norm, *after
 
 
-def regress_value(
-    config: EpochConfig, state: EpochState, hyper: Hyperparams, key: PRNGKeyArray
-) -> tuple[Mapping[str, Any], Any, Float[Array, " 2"]]:
+@partial(jax.jit, static_argnums=0)
+def learn_value(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
     """
-    As :func:`regress_policy` does. The value, which is asked for at the ends of plans, learns from
-    all of their steps.
+    Regress the value on the remembered samples. It is evaluated at the ends of plans, so it learns
+    from all of their steps.
 
-    :return: the value's parameters and the state of Adam; the mean loss, and the mean norm of the
-        gradient before it is clipped
+    :return: the value's parameters, the state of Adam, and the mean loss
     """
     inside = state.networks.inside
+    _, key = _next_keys(state)
 
     def loss(value, batch: Samples) -> jax.Array:
         found = value_of(output(config.value, value, inside(batch.obs)))
@@ -178,7 +185,8 @@ def regress_value(
     n_columns = config.horizon * config.n_rollouts
     begin = state.networks.value, state.progress.value_optimizer
     keys = lambda i: jax.random.split(jax.random.fold_in(key, i))[1]  # noqa: E731
-    return _descent(config, state, hyper, loss, n_columns, keys, *begin)
+    value, optimizer, losses = _descent(config, state, hyper, loss, n_columns, keys, *begin)
+    return value, optimizer, losses[0]
 
 
 def _descent(
@@ -238,7 +246,7 @@ def learn_from_plans(
     """
     learning = [partial(each, config, state, hyper) for each in regressions(config)]
     of_policy, *of_value = side_by_side(learning)
-    (actor, optimizer, (loss, norm)), average, n_epochs, key = of_policy
+    actor, average, optimizer, loss, norm, n_epochs, key = of_policy
     nets = state.networks._replace(actor=actor, average=average)
     progress = state.progress._replace(actor_optimizer=optimizer, n_epochs=n_epochs, key=key)
     value_loss: Any = 0.0
@@ -252,28 +260,6 @@ def learn_from_plans(
 def regressions(config: EpochConfig) -> list[Callable[..., Any]]:
     """:return: the programs of the second half of an epoch"""
     return [learn_policy, *([learn_value] if config.terminal_value else [])]
-
-
-@partial(jax.jit, static_argnums=0)
-def learn_policy(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
-    """
-    :return: see :func:`~sb3_hds.algos.twin.regression.regress_policy`; the average of policies, the
-        number of epochs and the random key after this one
-    """
-    nets, progress = state.networks, state.progress
-    key, k_regress = _next_keys(state)
-    actor, optimizer, (loss, norm) = regress_policy(config, state, hyper, k_regress)
-    decay = jnp.where(progress.n_epochs > 0, hyper.averaging, 0.0)
-    average = jax.tree.map(lambda a, new: decay * a + (1.0 - decay) * new, nets.average, actor)
-    learned = (actor, optimizer, (loss, norm))
-    return learned, average, progress.n_epochs + 1, jax.random.key_data(key)
-
-
-@partial(jax.jit, static_argnums=0)
-def learn_value(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
-    """:return: the value's parameters, the state of Adam, and the mean loss"""
-    value, optimizer, losses = regress_value(config, state, hyper, _next_keys(state)[1])
-    return value, optimizer, losses[0]
 
 
 def side_by_side(works: Sequence[Callable[[], Any]]) -> list[Any]:

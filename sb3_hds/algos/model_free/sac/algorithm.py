@@ -16,13 +16,13 @@ from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from sb3_hds.algos.base.config import between, takes
 from sb3_hds.algos.base.construct import jax_device
 from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
-from sb3_hds.algos.model_free.sac.objectives import squared_error
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free.sac.update import (
     Hyperparams,
     UpdateConfig,
     UpdateMetrics,
     log_of,
+    squared_error,
     update,
 )
 from sb3_hds.algos.model_free.update import batches_of, zero_metrics
@@ -74,8 +74,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
         "SimbaPolicy": SimbaPolicy,
     }
     policy_family = GaussianPolicy
-    #: fields of the state that ``param_resets`` leaves as they are
-    kept_by_restarts: ClassVar[tuple[str, ...]] = ("log_ent_coef", "obs_stats", "n_updates")
+    # The entropy coefficient and its optimiser, too, as in SBX.
+    kept_by_restarts = ("log_ent_coef", "obs_stats", "n_updates")
     policy: GaussianPolicy
     ent_coef: float | str
     target_entropy: float | str
@@ -152,22 +152,15 @@ class SoftActorCritic(ModelFreeAlgorithm):
             )
         self.policy.build(config, start, seed, device)
 
-    def _restart(self, seed: int) -> None:
-        """The entropy coefficient stays with its optimiser, as in SBX, but for BRO."""
-        before = self.policy.agent_state
-        self._build(seed)
-        kept = {name: getattr(before, name) for name in self.kept_by_restarts}
-        self.policy.agent_state = self.policy.agent_state._replace(**kept)
-
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
         policy, hyper, report, found = self.policy, self.hyper(), {}, zero_metrics(UpdateMetrics)
         for done in range(0, n, _MOST_UPDATES):
             now = min(_MOST_UPDATES, n - done)
-            batches = batches_of(self.replay_source, now, batch_size, _capacity(now))
+            batches = batches_of(self.replay_source, now, batch_size, next_power_of_2(now))
             state, found = update(
                 policy.update_config, policy.agent_state, batches, now, hyper, found
             )
-            report = _plain(found)
+            report = {name: float(x) for name, x in jax.device_get(found)._asdict().items()}
             self._take(state, report)
         return report
 
@@ -182,18 +175,54 @@ class SoftActorCritic(ModelFreeAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         # SB3 has drawn noise matrices at the start of the collection.
-        if self.use_sde and self.sde_sample_freq > 0 and self._collects_steps():
+        by_steps = self.train_freq.unit == TrainFrequencyUnit.STEP  # type: ignore[union-attr]
+        if self.use_sde and self.sde_sample_freq > 0 and by_steps:
             self.policy.keep_noise(n_envs, self.sde_sample_freq)
         return super()._sample_action(learning_starts, action_noise, n_envs)
-
-    def _collects_steps(self) -> bool:
-        freq: Any = self.train_freq
-        return freq.unit == TrainFrequencyUnit.STEP
 
     def stored(
         self, new_obs: np.ndarray | dict[str, np.ndarray], reward: np.ndarray, dones: np.ndarray
     ) -> None:
         self.policy.observed(new_obs)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class GSDESACConfig(SACConfig):
+    """
+    Arguments of gSDE-SAC.
+
+    :param use_sde: False: independent noise at each step, and with ``train_freq=1,
+        gradient_steps=1`` plain SAC
+    :param policy_kwargs: ``log_std_init``, ``full_std``, ``use_expln``, ``clip_mean`` and those of
+        every :class:`~sb3_hds.algos.GaussianPolicy`
+    """
+
+    _: KW_ONLY
+    use_sde: bool = True
+    train_freq: int | tuple[int, str] | None = 8
+    gradient_steps: int = 8
+
+
+class GSDESAC(SoftActorCritic):
+    r"""
+    SAC that explores by :math:`a = \mu(s) + \theta^T z(s)` with a noise matrix :math:`\theta` that
+    is redrawn every few steps: smooth, state-dependent exploration that does not wear out motors.
+
+    Source: Raffin, Kober and Stulp, *Smooth Exploration for Robotic Reinforcement Learning*, CoRL
+    2021; on Haarnoja et al., *Soft Actor-Critic Algorithms and Applications*, 2018. SBX draws
+    noise that does not depend on the state and reports a deviation of 0; here, the features of the
+    actor, the learned deviations (``log_std_init``, ``full_std``, ``use_expln``), ``clip_mean``,
+    the marginal variance in the log-probability and ``use_sde_at_warmup`` are those of SB3. Unlike
+    SB3, updates draw the noise of each state independently: its distribution is the same, its
+    gradient varies less. Without ``sde_sample_freq``, each collection of ``train_freq`` steps
+    begins with new noise.
+    """
+
+    config_class = GSDESACConfig
+
+    @takes(GSDESACConfig)
+    def __init__(self, config: GSDESACConfig) -> None:
+        self.construct(config)
 
 
 def initial_ent_coef(ent_coef: float | str) -> float:
@@ -218,10 +247,6 @@ def initial_ent_coef(ent_coef: float | str) -> float:
     return value
 
 
-def _capacity(n: int) -> int:
-    """:return: the power of 2 from ``n`` on: few sizes are few compiled programs"""
+def next_power_of_2(n: int) -> int:
+    """:return: the least power of 2 that is at least ``n``: few sizes are few compiled programs"""
     return 1 << (n - 1).bit_length()
-
-
-def _plain(report: UpdateMetrics) -> dict[str, float]:
-    return {name: float(value) for name, value in jax.device_get(report)._asdict().items()}

@@ -15,19 +15,28 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.model_free.sac.algorithm import SACConfig, SoftActorCritic
-from sb3_hds.algos.model_free.sac.objectives import mean_q, mean_values, quantile_huber
+from sb3_hds.algos.model_free.sac.networks import (
+    ORTHOGONAL,
+    ORTHONORMAL,
+    Gaussian,
+    Hidden,
+    Last,
+    orthogonal,
+    squashed_between,
+)
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, GaussianPolicyConfig
+from sb3_hds.algos.model_free.sac.tqc import quantile_huber
 from sb3_hds.algos.model_free.sac.update import (
     Hyperparams,
     SACState,
     UpdateConfig,
-    actor_distribution,
+    forward,
+    mean_q,
+    mean_values,
     q_values,
 )
 from sb3_hds.algos.model_free.update import Batch
-from sb3_hds.algos.nets.heads import Gaussian, squashed_between
-from sb3_hds.algos.nets.mlp import ORTHOGONAL, ORTHONORMAL, BroNet, Last, orthogonal
-from sb3_hds.algos.nets.options import Optimizer, TrainState, Weights
+from sb3_hds.algos.nets.options import Activation, Optimizer, TrainState, Weights
 
 # Steps of the environment at which the authors reset the networks: with the full replay ratio,
 # and with the fast one of 2.
@@ -168,6 +177,32 @@ class BRO(SoftActorCritic):
         )
 
 
+class BroNet(nn.Module):
+    """
+    Residual blocks with layer norm after each dense layer.
+
+    Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
+    sample-efficient continuous control*, NeurIPS 2024, section 3 (BroNet).
+
+    :param net_arch: width of each block; where it changes, a dense layer leads to the next; none:
+        the input itself
+    :param activation_fn: between the layers
+    """
+
+    net_arch: Sequence[int]
+    activation_fn: Activation
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
+        dense = lambda width: Hidden(width, kernel_init=ORTHOGONAL)  # noqa: E731
+        for i, width in enumerate(self.net_arch):
+            if i == 0 or x.shape[-1] != width:
+                x = self.activation_fn(nn.LayerNorm()(dense(width)(x)))
+            inside = self.activation_fn(nn.LayerNorm()(dense(width)(x)))
+            x = x + nn.LayerNorm()(dense(width)(inside))
+        return x
+
+
 class MeanShift(nn.Module):
     """
     How far the optimistic actor's mean is from the other one's.
@@ -227,7 +262,7 @@ class OptimisticActor:
     ) -> Any:
         act_key, q_key = jax.random.split(key)
         own, critics = state.extra, state.critic.weights
-        gaussian, _ = actor_distribution(config.actor, state.actor.weights, batch.obs)
+        gaussian, _ = forward(config.actor, state.actor.weights, batch.obs)
         optimism, regularizer = (
             _multiplier(own[name].weights["params"]) for name in ("optimism", "regularizer")
         )

@@ -14,7 +14,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from sb3_hds.algos.base.config import is_count
-from sb3_hds.algos.model_free.sac.algorithm import SoftActorCritic
+from sb3_hds.algos.model_free.sac.algorithm import SoftActorCritic, next_power_of_2
 from sb3_hds.algos.model_free.sac.compiled_run import (
     Loop,
     Round,
@@ -89,7 +89,12 @@ def learn_compiled(
     seeds = [int(seed) for seed in seeds]
     _refuse_what_needs_python(model, total_timesteps, seeds)
     models = [_copy_of(model, seed) for seed in seeds]
-    loop = _loop_of(models[0], total_timesteps, _twin_for(model.get_env(), twin))
+    env: Any = model.get_env()
+    if twin is None:
+        twin = twin_of(env)
+    else:
+        check_mirrors(env, twin)
+    loop = _loop_of(models[0], total_timesteps, twin)
     runs, done = _begun(loop, models, seeds), []
     lost = np.zeros(len(seeds), bool)
     try:
@@ -184,21 +189,15 @@ def _copy_of(model: Algorithm, seed: int) -> Algorithm:
     return copy
 
 
-def _twin_for(env: Any, given: Twin | None) -> Twin:
-    if given is None:
-        return twin_of(env)
-    check_mirrors(env, given)
-    return given
-
-
 def _loop_of(model: SoftActorCritic, total_timesteps: int, twin: Twin) -> Loop:
     env: Any = model.get_env()
     frequency = model.train_freq.frequency  # type: ignore[union-attr]
+    n_steps = _rounded_up(total_timesteps, frequency)
     return Loop(
         twin=twin,
         update_config=model.policy.update_config,
         limit=_limit_of(env),
-        capacity=min(model.buffer_size, _capacity(_rounded_up(total_timesteps, frequency))),
+        capacity=min(model.buffer_size, max(_LEAST_CAPACITY, next_power_of_2(n_steps))),
         learning_starts=model.learning_starts,
         train_freq=frequency,
         gradient_steps=frequency if model.gradient_steps == -1 else model.gradient_steps,
@@ -315,11 +314,6 @@ def _diverged(report: Any) -> np.ndarray:
     """:return: of each seed, whether a number of its last updates is not finite"""
     values = jax.device_get(report)
     return ~np.logical_and.reduce([np.isfinite(value) for value in values])
-
-
-def _capacity(n: int) -> int:
-    """:return: a power of 2 from ``n`` on: few sizes are few compiled programs"""
-    return max(_LEAST_CAPACITY, 1 << (n - 1).bit_length())
 
 
 def _rounded_up(total_timesteps: int, frequency: int) -> int:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from sb3_hds.algos.model_free.sac.networks import ExploringActor, noise_std
 from sb3_hds.algos.model_free.sac.update import (
     Hyperparams,
     SACState,
@@ -23,7 +24,6 @@ from sb3_hds.algos.model_free.sac.update import (
     update_once,
 )
 from sb3_hds.algos.model_free.update import Batch, zero_metrics
-from sb3_hds.algos.nets.heads import ExploringActor, noise_std
 from sb3_hds.algos.nets.observations import RunningStats, normalize
 from sb3_hds.core import Params, State, Twin
 

@@ -5,8 +5,7 @@ from dataclasses import KW_ONLY
 
 from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.model_free.sac.algorithm import SACConfig, SoftActorCritic
-from sb3_hds.algos.model_free.sac.objectives import mean_q
-from sb3_hds.algos.model_free.sac.update import UpdateConfig
+from sb3_hds.algos.model_free.sac.update import UpdateConfig, mean_q
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

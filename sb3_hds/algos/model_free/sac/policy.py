@@ -14,24 +14,24 @@ import numpy as np
 
 from sb3_hds.algos.base.config import between, check_count, takes
 from sb3_hds.algos.base.policy import LearningPolicy, PolicyConfig
-from sb3_hds.algos.model_free.sac.objectives import min_q, min_values, squared_error
+from sb3_hds.algos.model_free.sac import networks
 from sb3_hds.algos.model_free.sac.update import (
     UpdateConfig,
-    actor_distribution,
     explore,
+    forward,
     init_state,
+    min_q,
+    min_values,
     q_values,
+    squared_error,
 )
-from sb3_hds.algos.nets.heads import USUAL, Critic, ExploringActor, GaussianActor, noise_std
-from sb3_hds.algos.nets.mlp import ORTHOGONAL, ORTHONORMAL, Mlp, SimbaNet
-from sb3_hds.algos.nets.observations import RunningStats, flattener, normalize, size_of
+from sb3_hds.algos.nets.observations import RunningStats, normalize
 from sb3_hds.algos.nets.options import (
     Activation,
     Optimizer,
     Weights,
     activation,
     optimizer_of,
-    widths,
 )
 from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.deploy.policy_function import PolicyFunction
@@ -159,27 +159,21 @@ class GaussianPolicy(LearningPolicy):
 
     def construct(self, config: GaussianPolicyConfig) -> None:
         """Describe networks and optimisers, which are drawn later."""
-        super().__init__(config.observation_space, config.action_space, squash_output=True)
-        self.config, self.arguments = config, config.arguments()
-        net = config.net_arch
-        self.arguments["net_arch"] = dict(net) if isinstance(net, Mapping) else net
-        self.widths = pi, qf = widths(net, "qf")
+        super().__init__(config)
+        pi, qf = self.widths
+        self.config, self.use_sde = config, config.use_sde
         self.activation_fn = activation(config.activation_fn)
         self.normalize_observations = bool(config.normalize_observations)
         self.n_critics, self.n_quantiles = config.n_critics, config.n_quantiles
-        self.use_sde = config.use_sde
-        self.n_obs = size_of(config.observation_space)
-        self.n_act = int(np.prod(config.action_space.shape))
-        self.flatten = flattener(config.observation_space)
         body, (of_mean, of_std) = self.actor_body(pi), self.last_layers()
         if config.use_sde:
             gsde = (config.log_std_init, config.full_std, config.use_expln, config.clip_mean)
-            self.actor_network = ExploringActor(body, self.n_act, *gsde, of_mean)
+            self.actor_network = networks.ExploringActor(body, self.n_act, *gsde, of_mean)
         else:
             asked = config.squash_log_std
             squash = config.squashes if asked is None else bool(asked)
-            self.actor_network = GaussianActor(body, self.n_act, squash, of_mean, of_std)
-        self.critic_network = Critic(self.critic_body(qf), config.n_quantiles, of_mean)
+            self.actor_network = networks.GaussianActor(body, self.n_act, squash, of_mean, of_std)
+        self.critic_network = networks.Critic(self.critic_body(qf), config.n_quantiles, of_mean)
         self.optimizers = config.optimizers()
         self.forget_noise()
         self._noise = np.random.default_rng(0)
@@ -190,15 +184,20 @@ class GaussianPolicy(LearningPolicy):
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
         return self._mlp(net_arch, float(self.config.dropout_rate), self.config.layer_norm)
 
-    def _mlp(self, net_arch: Sequence[int], dropout: float = 0.0, layer_norm: bool = False) -> Mlp:
-        of_batch = self.config.renorm_warmup_steps, self.config.batch_norm_momentum
-        start = bool(self.config.ortho_init)
-        return Mlp(net_arch, self.activation_fn, dropout, layer_norm, *of_batch, start)
+    def _mlp(
+        self, net_arch: Sequence[int], dropout: float = 0.0, layer_norm: bool = False
+    ) -> nn.Module:
+        batch_norm = self.config.renorm_warmup_steps, self.config.batch_norm_momentum
+        orthogonal = bool(self.config.ortho_init)
+        return networks.Mlp(
+            net_arch, self.activation_fn, dropout, layer_norm, *batch_norm, orthogonal
+        )
 
     def last_layers(self) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
-        """:return: where they start: those of means and values, and those of deviations"""
-        usual = self.config.ortho_init in (False, "hidden")
-        return (USUAL, USUAL) if usual else (ORTHOGONAL, ORTHONORMAL)
+        """:return: initialisers of the layers of means and values, and of that of ``log_std``"""
+        if self.config.ortho_init in (False, "hidden"):
+            return networks.USUAL, networks.USUAL
+        return networks.ORTHOGONAL, networks.ORTHONORMAL
 
     def build_plain(self) -> None:
         """That of SAC; with batch normalisation, that of CrossQ."""
@@ -284,7 +283,7 @@ class GaussianPolicy(LearningPolicy):
         """:return: standard deviation of the noise matrix's entries; 0 without gSDE"""
         if not self.use_sde:
             return np.zeros(1)
-        return np.asarray(noise_std(self.actor_network, self.agent_state.actor.weights))  # type: ignore[arg-type]
+        return np.asarray(networks.noise_std(self.actor_network, self.agent_state.actor.weights))  # type: ignore[arg-type]
 
     def policy_function(self) -> PolicyFunction:
         """:return: what the policy computes where nothing is explored, to be exported"""
@@ -300,14 +299,14 @@ class GaussianPolicy(LearningPolicy):
         actor, stats = state.actor.weights, state.obs_stats
         if deterministic:
             return np.asarray(_mean(self.actor_network, actor, stats, obs))
-        if not self.use_sde:
+        if self.use_sde:
+            if self.matrices is None:
+                self.reset_noise()
+            matrices: Any = self.matrices
+            noise = matrices if len(matrices) == len(obs) else matrices[:1]
+        else:
             noise = self._noise.standard_normal((len(obs), self.n_act), np.float32)
-            return np.asarray(_scattered(self.update_config, actor, state.extra, stats, obs, noise))
-        if self.matrices is None:
-            self.reset_noise()
-        matrices: Any = self.matrices
-        matrices = matrices if len(matrices) == len(obs) else matrices[:1]
-        return np.asarray(_moved(self.update_config, actor, state.extra, stats, obs, matrices))
+        return np.asarray(_exploratory(self.update_config, actor, state.extra, stats, obs, noise))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -346,10 +345,10 @@ class SimbaPolicy(GaussianPolicy):
         self.construct(config)
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
-        return SimbaNet(net_arch, self.activation_fn)
+        return networks.SimbaNet(net_arch, self.activation_fn)
 
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
-        return SimbaNet(net_arch, self.activation_fn, float(self.config.dropout_rate))
+        return networks.SimbaNet(net_arch, self.activation_fn, float(self.config.dropout_rate))
 
 
 def _check_ranges(config: GaussianPolicyConfig) -> None:
@@ -380,21 +379,22 @@ def _q_values(
 
 @partial(jax.jit, static_argnums=0)
 def _mean(actor: nn.Module, weights: Weights, stats: RunningStats, obs: Any) -> jax.Array:
-    return jnp.tanh(actor_distribution(actor, weights, normalize(stats, obs))[0].mean)
+    return jnp.tanh(forward(actor, weights, normalize(stats, obs))[0].mean)
 
 
 @partial(jax.jit, static_argnums=0)
-def _scattered(
+def _exploratory(
     config: UpdateConfig, weights: Weights, extra: Any, stats: RunningStats, obs: Any, noise: Any
 ) -> jax.Array:
-    return explore(config, weights, extra, normalize(stats, obs), lambda g: g.std * noise)
+    """
+    :param noise: standard normal, shape ``(batch, act)``; with gSDE a noise matrix for each
+        environment or one for all, shape ``(batch or 1, latent, act)``
+    """
 
+    def deviation(gaussian: networks.Gaussian) -> jax.Array:
+        if noise.ndim == 2:
+            return gaussian.std * noise
+        each = jnp.broadcast_to(noise, (obs.shape[0], *noise.shape[1:]))
+        return jnp.einsum("bl,bla->ba", gaussian.latent, each)
 
-@partial(jax.jit, static_argnums=0)
-def _moved(
-    config: UpdateConfig, weights: Weights, extra: Any, stats: RunningStats, obs: Any, matrices: Any
-) -> jax.Array:
-    """Every environment has its matrix; with one matrix, it is everybody's."""
-    each = jnp.broadcast_to(matrices, (obs.shape[0], *matrices.shape[1:]))
-    noise = lambda g: jnp.einsum("bl,bla->ba", g.latent, each)  # noqa: E731
-    return explore(config, weights, extra, normalize(stats, obs), noise)
+    return explore(config, weights, extra, normalize(stats, obs), deviation)

@@ -9,10 +9,9 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_hds.algos.base.config import Rate, takes
 from sb3_hds.algos.model_free.sac.algorithm import SACConfig, SoftActorCritic
-from sb3_hds.algos.model_free.sac.objectives import mean_q, mean_values
+from sb3_hds.algos.model_free.sac.networks import ORTHONORMAL
 from sb3_hds.algos.model_free.sac.policy import SimbaPolicy, SimbaPolicyConfig
-from sb3_hds.algos.model_free.sac.update import UpdateConfig
-from sb3_hds.algos.nets.mlp import ORTHONORMAL
+from sb3_hds.algos.model_free.sac.update import UpdateConfig, mean_q, mean_values
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

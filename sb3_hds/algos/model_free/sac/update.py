@@ -10,7 +10,7 @@ Polyak-average the target critics. What differs between two algorithms of the fa
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol
 
 import flax.linen as nn
 import jax
@@ -18,12 +18,15 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from sb3_hds.algos.model_free.sac.objectives import Loss, Targets, Values
+from sb3_hds.algos.model_free.sac.networks import Gaussian, log_probability
 from sb3_hds.algos.model_free.update import Batch, UpdateStep, apply_schedule
-from sb3_hds.algos.nets.heads import Gaussian, log_probability
 from sb3_hds.algos.nets.observations import RunningStats, normalize
 from sb3_hds.algos.nets.options import Optimizer, TrainState, Weights
 from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
+
+Values = Float[Array, "critics batch values"]
+Targets = Float[Array, "batch targets"]
+Loss = Float[Array, ""]
 
 
 class SACState(NamedTuple):
@@ -64,6 +67,9 @@ class UpdateMetrics(NamedTuple):
     ent_coef_loss: Loss
 
 
+_ADAM = Optimizer(optax.adam)
+
+
 @dataclasses.dataclass(frozen=True)
 class UpdateConfig:
     """
@@ -77,7 +83,7 @@ class UpdateConfig:
     :param actor_objective: values of all critics to what the actor maximises, shape ``(batch,)``
     :param optimizer: of the actor
     :param qf_optimizer: of the critics
-    :param ent_coef_optimizer: of the logarithm of the entropy coefficient; None: Adam
+    :param ent_coef_optimizer: of the logarithm of the entropy coefficient
     :param policy_delay: updates of the critics for each of the actor
     :param target_update_interval: updates of the critics for each of the target critics
     :param learns_ent_coef: whether the entropy coefficient is adapted to the target entropy
@@ -96,7 +102,7 @@ class UpdateConfig:
     actor_objective: Callable[[Values], Float[Array, " batch"]]
     optimizer: Optimizer
     qf_optimizer: Optimizer
-    ent_coef_optimizer: Optimizer | None = None
+    ent_coef_optimizer: Optimizer = _ADAM
     policy_delay: int = 1
     target_update_interval: int = 1
     learns_ent_coef: bool = True
@@ -139,12 +145,13 @@ def init_state(
     init = lambda key: config.critic.init({"params": key, "dropout": key}, obs, action)  # noqa: E731
     critic = jax.vmap(init)(jax.random.split(critic_key, config.n_critics))
     log_ent_coef = {"params": log_of(ent_coef)}
-    of_ent_coef = config.ent_coef_optimizer or _ADAM
     return SACState(
         actor=TrainState(actor, config.optimizer.init(actor["params"])),
         critic=TrainState(critic, config.qf_optimizer.init(critic["params"])),
         target={} if config.joint_pass else critic,
-        log_ent_coef=TrainState(log_ent_coef, of_ent_coef.init(log_ent_coef["params"])),
+        log_ent_coef=TrainState(
+            log_ent_coef, config.ent_coef_optimizer.init(log_ent_coef["params"])
+        ),
         obs_stats=RunningStats.empty(n_obs),
         extra=config.extra.init(actor, obs, extra_key) if config.extra else {},
         key=key,
@@ -196,14 +203,13 @@ def update_once(
         )
     critics = partial(update_critics, config, batch, hyper)
     actor = partial(update_actor, config, batch, hyper)
+    target = partial(soft_update, hyper.tau)
     steps = [
         UpdateStep(("critic",), 1, critics),
         UpdateStep(("actor", "log_ent_coef", "extra"), config.policy_delay, actor),
+        UpdateStep(("target",), config.target_update_interval, target),
     ]
-    if not config.joint_pass:
-        polyak = partial(soft_update, hyper.tau)
-        steps.append(UpdateStep(("target",), config.target_update_interval, polyak))
-    return apply_schedule(state, metrics, *steps)
+    return apply_schedule(state, metrics, *steps[: 2 if config.joint_pass else 3])
 
 
 def update_critics(
@@ -219,30 +225,25 @@ def update_critics(
     :math:`a' \sim \pi(s')`.
     """
     act_key, key, next_key = jax.random.split(key, 3)
-    gaussian, _ = actor_distribution(config.actor, state.actor.weights, batch.next_obs)
+    gaussian, _ = forward(config.actor, state.actor.weights, batch.next_obs)
     next_action, log_prob = sample(gaussian, act_key)
     bonus = -jnp.exp(state.log_ent_coef.weights["params"]) * log_prob
     reward, discount = batch.reward, batch.discount * (1.0 - batch.terminated)
 
-    def soft_targets(next_values: Values) -> Targets:
-        chosen = config.target_values(next_values) + bonus[:, None]
-        return jax.lax.stop_gradient(reward[:, None] + discount[:, None] * chosen)
-
-    def separate_passes(params: Any) -> tuple[Loss, Weights]:
-        next_values, _ = q_values(config, state.target, batch.next_obs, next_action, next_key)
+    def loss(params: Any) -> tuple[Loss, Weights]:
         weights = {**state.critic.weights, "params": params}
-        values, weights = q_values(config, weights, batch.obs, batch.action, key, train=True)
-        return config.critic_loss(values, soft_targets(next_values)), weights
+        if config.joint_pass:
+            obs = jnp.concatenate([batch.obs, batch.next_obs])
+            action = jnp.concatenate([batch.action, next_action])
+            both, weights = q_values(config, weights, obs, action, key, train=True)
+            values, next_values = jnp.split(both, 2, axis=1)
+        else:
+            next_values, _ = q_values(config, state.target, batch.next_obs, next_action, next_key)
+            values, weights = q_values(config, weights, batch.obs, batch.action, key, train=True)
+        soft = config.target_values(next_values) + bonus[:, None]
+        targets = jax.lax.stop_gradient(reward[:, None] + discount[:, None] * soft)
+        return config.critic_loss(values, targets), weights
 
-    def joint_pass(params: Any) -> tuple[Loss, Weights]:
-        weights = {**state.critic.weights, "params": params}
-        obs = jnp.concatenate([batch.obs, batch.next_obs])
-        action = jnp.concatenate([batch.action, next_action])
-        both, weights = q_values(config, weights, obs, action, key, train=True)
-        values, next_values = jnp.split(both, 2, axis=1)
-        return config.critic_loss(values, soft_targets(next_values)), weights
-
-    loss = joint_pass if config.joint_pass else separate_passes
     gradient = jax.value_and_grad(loss, has_aux=True)
     (value, weights), slope = gradient(state.critic.weights["params"])
     critic = config.qf_optimizer.apply(
@@ -276,7 +277,7 @@ def update_actor(
 
     def loss(params: Any) -> tuple[Loss, tuple[Array, Weights]]:
         weights = {**state.actor.weights, "params": params}
-        gaussian, weights = actor_distribution(config.actor, weights, batch.obs, train=True)
+        gaussian, weights = forward(config.actor, weights, batch.obs, train=True)
         action, log_prob = sample(gaussian, act_key)
         values, _ = q_values(config, state.critic.weights, batch.obs, action, q_key)
         objective = config.actor_objective(values)
@@ -295,9 +296,8 @@ def update_actor(
         ent_coef_loss=excess * (ent_coef if linear else log_ent_coef.weights["params"]),
     )
     if config.learns_ent_coef:
-        of_ent_coef = config.ent_coef_optimizer or _ADAM
         slope = excess * ent_coef if linear else excess
-        log_ent_coef = of_ent_coef.apply(slope, log_ent_coef, hyper.learning_rate)
+        log_ent_coef = config.ent_coef_optimizer.apply(slope, log_ent_coef, hyper.learning_rate)
     extra = state.extra
     if config.extra is not None:
         now = state._replace(actor=actor, log_ent_coef=log_ent_coef)
@@ -313,17 +313,45 @@ def soft_update(
     return (jax.tree.map(average, state.target, state.critic.weights),), metrics
 
 
+# --- what UpdateConfig chooses from
+
+
+def min_values(values: Values) -> Targets:
+    """Of the critics, value by value: clipped double Q-learning (Fujimoto et al. 2018)."""
+    return jnp.min(values, 0)
+
+
+def mean_values(values: Values) -> Targets:
+    """Of the critics, value by value (BRO)."""
+    return jnp.mean(values, 0)
+
+
+def squared_error(values: Values, targets: Targets) -> Loss:
+    """Half the mean squared error, summed over critics."""
+    return 0.5 * jnp.sum(jnp.mean((values - targets[None]) ** 2, (1, 2)))
+
+
+def min_q(values: Values) -> Float[Array, " batch"]:
+    """Minimum over critics (SAC)."""
+    return jnp.min(jnp.mean(values, -1), 0)
+
+
+def mean_q(values: Values) -> Float[Array, " batch"]:
+    """Mean over critics and quantiles (DroQ, TQC, BRO)."""
+    return jnp.mean(values, (0, 2))
+
+
 # --- forward passes
 
 
-def actor_distribution(
-    actor: nn.Module, weights: Weights, obs: Array, train: bool = False
-) -> tuple[Gaussian, Weights]:
-    """:return: the actor's Gaussian, and its weights with the statistics of this pass"""
+def forward(
+    network: nn.Module, weights: Weights, *inputs: Any, train: bool = False, **rngs: Any
+) -> tuple[Any, Weights]:
+    """:return: what the network computes, and its weights with the batch statistics of this pass"""
     if not train or "statistics" not in weights:
-        return cast(Gaussian, actor.apply(weights, obs, train)), weights
-    gaussian, changed = actor.apply(weights, obs, train, mutable=["statistics"])
-    return cast(Gaussian, gaussian), {**weights, **changed}
+        return network.apply(weights, *inputs, train, **rngs), weights
+    output, changed = network.apply(weights, *inputs, train, **rngs, mutable=["statistics"])
+    return output, {**weights, **changed}
 
 
 def q_values(
@@ -339,16 +367,8 @@ def q_values(
     :return: values of all critics, and their weights with the statistics of this pass
     """
 
-    def one(
-        weights: Weights, key: PRNGKeyArray, obs: Array, action: Array
-    ) -> tuple[Array, Weights]:
-        rngs = {"dropout": key}
-        if not train or "statistics" not in weights:
-            return cast(Array, config.critic.apply(weights, obs, action, train, rngs=rngs)), weights
-        values, changed = config.critic.apply(
-            weights, obs, action, train, rngs=rngs, mutable=["statistics"]
-        )
-        return cast(Array, values), {**weights, **changed}
+    def one(weights: Weights, key: PRNGKeyArray, *inputs: Array) -> tuple[Array, Weights]:
+        return forward(config.critic, weights, *inputs, train=train, rngs={"dropout": key})
 
     keys = jax.random.split(key, config.n_critics)
     if config.n_critics > 1:
@@ -376,7 +396,7 @@ def explore(
     :param noise: maps a Gaussian to deviations from its mean, before tanh
     :return: exploratory actions
     """
-    gaussian, _ = actor_distribution(config.actor, weights, obs)
+    gaussian, _ = forward(config.actor, weights, obs)
     if config.extra is not None:
         return config.extra.explore(extra, obs, gaussian, noise(gaussian))
     return jnp.tanh(gaussian.mean + noise(gaussian))
@@ -385,6 +405,3 @@ def explore(
 def log_of(ent_coef: Array | float) -> Array:
     """:return: its logarithm; of 0, that of the least positive number, with no infinity in it"""
     return jnp.log(jnp.maximum(jnp.asarray(ent_coef, jnp.float32), jnp.finfo(jnp.float32).tiny))
-
-
-_ADAM = Optimizer(optax.adam)

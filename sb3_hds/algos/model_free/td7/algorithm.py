@@ -178,7 +178,7 @@ class TD7(ModelFreeAlgorithm):
         super()._setup_model()
         if self.action_noise is None and self.exploration_noise:
             # SB3 adds it to actions of the space's shape.
-            size = np.full(self.policy.action_shape, self.exploration_noise, np.float32)
+            size = np.full(self.action_space.shape or (), self.exploration_noise, np.float32)
             self.action_noise = NormalActionNoise(np.zeros_like(size), size)
             self._derived_noise = self.action_noise
 
@@ -223,14 +223,10 @@ class TD7(ModelFreeAlgorithm):
     def _build(self, seed: int) -> None:
         self.policy.build(self.update_config(), seed, jax_device(self._device_name))
 
-    def _restart(self, seed: int) -> None:
-        """The policy of the last checkpoint goes on acting until a new one does no worse."""
-        before = self.policy.agent_state
-        self._build(seed)
-        kept: dict[str, Any] = {"n_updates": before.n_updates}
-        if before.checkpoint.kept > 0.0:
-            kept["checkpoint"] = before.checkpoint
-        self.policy.agent_state = self.policy.agent_state._replace(**kept)
+    @property
+    def kept_by_restarts(self) -> tuple[str, ...]:
+        """The policy of the last checkpoint acts until a new one does no worse."""
+        return ("n_updates", "checkpoint") if self.policy.has_checkpoint else ("n_updates",)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """

@@ -21,8 +21,7 @@ from sb3_hds.algos.model_free.td7.update import (
     init_state,
     q_values,
 )
-from sb3_hds.algos.nets.observations import flattener, size_of
-from sb3_hds.algos.nets.options import Activation, activation, optimizer_of, widths
+from sb3_hds.algos.nets.options import Activation, activation, optimizer_of
 from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.deploy.policy_function import PolicyFunction
 
@@ -73,14 +72,10 @@ class TD7Policy(LearningPolicy):
 
     @takes(TD7PolicyConfig)
     def __init__(self, config: TD7PolicyConfig) -> None:
-        super().__init__(config.observation_space, config.action_space, squash_output=True)
-        self.arguments = config.arguments()
+        super().__init__(config)
         del self.arguments["use_sde"]
-        self.widths = pi, qf = widths(config.net_arch, "qf")
+        pi, qf = self.widths
         of_values = activation(config.qf_activation_fn)
-        self.n_obs = size_of(config.observation_space)
-        self.action_shape = config.action_space.shape
-        self.n_act = int(np.prod(self.action_shape))
         optimizer = optimizer_of(config.optimizer_class, config.optimizer_kwargs or {})
         self.parts: dict[str, Any] = {
             "encoder": Encoder(config.embedding_size, qf, of_values),
@@ -90,7 +85,6 @@ class TD7Policy(LearningPolicy):
             "optimizer": optimizer,
             "qf_optimizer": optimizer,
         }
-        self.flatten = flattener(config.observation_space)
 
     def build_plain(self) -> None:
         """That of the paper."""

@@ -24,11 +24,11 @@ from sb3_hds.algos.twin.hds.correction import (
     names_to_estimate,
 )
 from sb3_hds.algos.twin.hds.recorded_steps import RecordedSteps, Source, data_from
-from sb3_hds.algos.twin.model import check_known, missing_effects, nulls_of, required
+from sb3_hds.algos.twin.model import missing_effects, nulls_of, required
 from sb3_hds.algos.twin.pretraining import meanwhile, nothing
 from sb3_hds.core import Effect, Params, Trajectories, Twin
 from sb3_hds.core.twin import plant_of
-from sb3_hds.effects import ALL, SignFlip, force_of, reversed_joint
+from sb3_hds.effects import ALL, KNOWN, SignFlip, effect_named, force_of, reversed_joint
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.sysid import Diagnosis, Finding, diagnose
 
@@ -329,7 +329,8 @@ class HDS(TwinAlgorithm):
 
     def _prepared(self, twin: Twin) -> Twin:
         config = self.config
-        check_known(config.suspected)
+        for name in config.suspected:
+            effect_named(name, KNOWN)  # raises if it is unknown
         missing = missing_effects(twin, config.effects)
         twin = twin.extend(*missing) if missing else twin
         if self.twin_spec is None or not self.nominal:

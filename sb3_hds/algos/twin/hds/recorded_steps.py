@@ -257,10 +257,6 @@ class Recordings:
         #: and where it stood
         self._n_steps, self._position = 0, 0
 
-    def look_at(self, buffer: Any) -> None:
-        """To be called at least once while the buffer is filled."""
-        self._n_steps, self._position = self.n_steps(buffer), buffer.pos
-
     def n_steps(self, buffer: Any) -> int:
         """:return: steps of each environment that went through the buffer, those lost included"""
         since = (buffer.pos - self._position) % buffer.buffer_size
@@ -273,10 +269,12 @@ class Recordings:
 
     def numbers(self, buffer: Any, begins: Sequence[tuple[int, int]]) -> list[int]:
         """
+        To be called at least once each time that the buffer is filled.
+
         :param begins: of each recording, steps since the oldest one in the buffer, and environment
         :return: its number; -1 for the rest of one whose beginning is lost
         """
-        self.look_at(buffer)
+        self._n_steps, self._position = self.n_steps(buffer), buffer.pos
         first = self._n_steps - buffer.size()
         starts = [(first + row) * buffer.n_envs + env for row, env in begins]
         # In each environment the first one that is left may have begun earlier.
