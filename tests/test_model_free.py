@@ -65,9 +65,9 @@ def test_after_the_same_seed_a_model_explores_and_learns_alike():
 
 @each(
     ("droq", {"policy_kwargs": {"log_std_init": -2.0}}, "log_std_init .* without use_sde"),
-    ("crossq_jax", {"tau": 0.01}, "does not look at tau"),
+    ("crossq_jax", {"tau": 0.01}, "ignores tau"),
     ("droq", {"use_sde": True, "train_freq": 1}, "a new noise matrix at each step"),
-    ("td7", {"gradient_steps": 2, "use_checkpoints": True}, "does not look at gradient_steps"),
+    ("td7", {"gradient_steps": 2, "use_checkpoints": True}, "ignores gradient_steps"),
 )
 def test_arguments_that_say_nothing_are_warned_of(name, arguments, message):
     with pytest.warns(UserWarning, match=message):

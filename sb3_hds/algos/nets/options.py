@@ -1,4 +1,4 @@
-"""Activations, widths and optimisers as users give them: by name, of JAX, optax or torch."""
+"""Activations, widths and optimisers, by name or as functions of JAX, optax or torch."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +29,7 @@ _TORCH_MODULES: dict[type, str] = {
     for kind in vars(th.nn).values()
     if isinstance(kind, type) and kind.__name__.lower() in _BY_LETTERS
 } | {th.nn.GELU: "gelu_exact"}
-# Functions of the same names, of which torch has some twice; the first entry counts.
+# With functions of the same names, some of which torch has twice; the first entry counts.
 _OF_TORCH: list[tuple[Any, str]] = [
     *_TORCH_MODULES.items(),
     (functional.gelu, "gelu_exact"),
@@ -49,8 +49,8 @@ OPTIMIZERS = {
         *("adabelief", "lion", "adamax", "adadelta", "adagrad"),
     )
 }
-# Of torch's classes: where their defaults are not those of optax. NAdam's momentum has a schedule
-# that optax does not have.
+# Torch's optimisers with the defaults that differ from optax's. NAdam's momentum schedule has no
+# equivalent in optax.
 _TORCH: dict[str, dict[str, Any]] = {
     "adam": {},
     "adamw": {"weight_decay": 1e-2},
@@ -65,11 +65,11 @@ _TORCH: dict[str, dict[str, Any]] = {
 
 def activation(choice: str | Activation | type) -> Activation:
     """
-    :param choice: a name ("relu", any case; "gelu" is JAX's approximation by tanh, "gelu_exact"
-        what torch means by ``GELU``), a JAX function, which is taken as it is, or of torch a
-        function, a module class, or a module without settings of its own
-    :raises ValueError: for a name, or something of torch, without an equal here, and for a function
-        that JAX cannot trace, or that changes the shape of what it is given
+    :param choice: a name ("relu", any case; "gelu" is JAX's approximation by tanh, "gelu_exact" is
+        torch's ``GELU``), a JAX function, or torch's function, module class, or module with default
+        settings
+    :raises ValueError: for a name or an object of torch without an equivalent here, and for a
+        function that JAX cannot trace or that changes the shape of its input
     """
     name = choice if isinstance(choice, str) else _torch_name(choice)
     letters = name.lower().replace("_", "")
@@ -124,7 +124,7 @@ def _checked(function: Activation) -> Activation:
 
 
 def _torch_name(choice: Any) -> str:
-    """:return: of an activation of torch itself; of anything else, the empty string"""
+    """:return: our name of an activation of torch; for anything else, the empty string"""
     if isinstance(choice, th.nn.GELU) and choice.approximate == "tanh":
         return "gelu"
     kind = type(choice)
@@ -134,7 +134,7 @@ def _torch_name(choice: Any) -> str:
 
 
 def _widths_of(given: Any) -> tuple[int, ...] | None:
-    """:return: widths of layers as Python has them; None unless all are whole numbers above 0"""
+    """:return: widths of layers as Python integers; None unless all are whole numbers above 0"""
     if isinstance(given, np.ndarray):
         given = given.tolist()
     if not isinstance(given, Sequence):
@@ -168,15 +168,17 @@ def widths(
 
 
 def finite_leaves(tree: Any) -> bool:
-    """:return: whether no number in it is infinite or not a number"""
+    """:return: whether all numbers of the pytree are finite"""
     numbers = (leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact))
     return all(np.isfinite(leaf).all() for leaf in numbers)
 
 
 class TrainState(NamedTuple):
     """
-    :param weights: flax variables, ``"params"`` and, where there are some, ``"statistics"``
-    :param optimizer: state of the optimiser of the params
+    A network and its optimiser.
+
+    :param weights: flax variables: ``"params"`` and, with batch normalisation, ``"statistics"``
+    :param optimizer: state of the optimiser of ``"params"``
     """
 
     weights: Weights
@@ -186,9 +188,9 @@ class TrainState(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Optimizer:
     """
-    An optax optimiser, without its learning rate, so that schedules act without compiling again.
+    An optax optimiser without its learning rate, so that schedules do not recompile programs.
 
-    :param make: ``optax.adam`` or one that is called like it
+    :param make: ``optax.adam`` or a function with the same signature
     :param arguments: besides the learning rate
     """
 
@@ -199,6 +201,7 @@ class Optimizer:
         return self._transformation.init(params)
 
     def apply(self, gradient: Any, trained: TrainState, rate: Any) -> TrainState:
+        """:return: the network and the optimiser after a step with this learning rate"""
         params = trained.weights["params"]
         step, state = self._transformation.update(gradient, trained.optimizer, params)
         step = jax.tree.map(lambda s: rate * s, step)
@@ -212,9 +215,9 @@ class Optimizer:
 
 def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -> Optimizer:
     """
-    :param make: name or function of optax, with its defaults, or torch class, with those of torch
+    :param make: name or function of optax, with its defaults, or torch class, with torch's defaults
     :param arguments: of optax's function, or torch's ``betas`` and ``alpha``
-    :raises ValueError: for one that is not known here
+    :raises ValueError: for an unknown optimiser and for arguments that it does not have
     """
     arguments = dict(arguments)
     if "betas" in arguments:
@@ -223,7 +226,7 @@ def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -
         arguments["decay"] = arguments.pop("alpha")
     name = make if isinstance(make, str) else getattr(make, "__name__", "")
     of_torch = isinstance(make, type) and issubclass(make, th.optim.Optimizer)
-    # A function is taken as it is, whatever its name.
+    # A function is used as given, whatever its name.
     found = OPTIMIZERS.get(name.lower()) if isinstance(make, str) or of_torch else None
     if of_torch:
         if name.lower() not in _TORCH or getattr(th.optim, name) is not make:

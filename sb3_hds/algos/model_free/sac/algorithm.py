@@ -1,4 +1,4 @@
-"""The shell of the SAC family."""
+"""What the SAC family shares, and SAC itself, with gSDE unless it is switched off."""
 
 import dataclasses
 import math
@@ -27,7 +27,7 @@ from sb3_hds.algos.model_free.sac.update import (
 )
 from sb3_hds.algos.model_free.update import batches_of, zero_metrics
 
-# Updates of one compiled call; more are made in several.
+# Updates per compiled call.
 _MOST_UPDATES = 64
 
 
@@ -37,13 +37,13 @@ class SACConfig(ModelFreeConfig):
     Arguments of the SAC family.
 
     :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"`` to start there
-    :param target_entropy: a number, or ``"auto"``: minus the number of controls; of SimBa and BRO,
+    :param target_entropy: a number, or ``"auto"``: minus the number of actions, with SimBa and BRO
         half of that
     :param linear_ent_coef: whether the loss of the entropy coefficient is linear in the coefficient
-        itself, as equation 18 of the paper, not in its logarithm, as in SB3, SBX and the authors'
-        code of DroQ and TQC
+        itself, as in equation 18 of the paper, instead of in its logarithm, as in SB3, SBX and the
+        authors' code of DroQ and TQC
     :param target_update_interval: updates of the critics between two updates of the target critics,
-        counted from the first; SB3 restarts counting in each call of ``train``
+        counted from the first; SB3 restarts the count in each call of ``train``
     """
 
     _: KW_ONLY
@@ -74,14 +74,14 @@ class SoftActorCritic(ModelFreeAlgorithm):
         "SimbaPolicy": SimbaPolicy,
     }
     policy_family = GaussianPolicy
-    # The entropy coefficient and its optimiser, too, as in SBX.
+    # With the entropy coefficient and its optimiser, as in SBX.
     kept_by_restarts = ("log_ent_coef", "obs_stats", "n_updates")
     policy: GaussianPolicy
     ent_coef: float | str
     target_entropy: float | str
 
     config_class = SACConfig
-    #: arguments of the policy unless they are given
+    #: the algorithm's defaults for arguments of the policy
     usual_policy_kwargs: ClassVar[Mapping[str, Any]] = {}
 
     @takes(SACConfig)
@@ -94,8 +94,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
 
     def update_config(self) -> UpdateConfig:
         """
-        What an update is made of: SAC's for the networks of the policy, see
-        ``GaussianPolicy.plain_update_config``, with the arguments of this algorithm. Subclasses
+        Config of the update: that of SAC for the networks of the policy
+        (``GaussianPolicy.plain_update_config``) with the arguments of this algorithm. Subclasses
         replace parts of it.
         """
         config = self.config
@@ -108,7 +108,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         )
 
     def auto_target_entropy(self) -> float:
-        """:return: what ``target_entropy="auto"`` means here"""
+        """:return: the value of ``target_entropy="auto"``"""
         return -float(self.policy.n_act)
 
     def check_environment(self, config: Any) -> None:
@@ -135,8 +135,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
     ) -> None:
         super().set_parameters(load_path_or_dict, exact_match, device)
         if not isinstance(self.ent_coef, str):
-            # A fixed coefficient is an argument, not learned: keep this model's own value. ``load``
-            # calls this, too.
+            # A fixed coefficient is an argument, so keep this model's value; `load` gets here, too.
             before = self.policy.agent_state.log_ent_coef
             fixed = {"params": log_of(self.ent_coef)}
             now = before._replace(weights=fixed)
@@ -165,7 +164,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         return report
 
     def hyper(self) -> Hyperparams:
-        """:return: what schedules make of the arguments, at this point of the training"""
+        """:return: the current values of the hyperparameters that may change"""
         rate, qf_rate = self.learning_rates()
         entropy = self.target_entropy
         wanted = self.auto_target_entropy() if entropy == "auto" else float(entropy)
@@ -191,10 +190,10 @@ class GSDESACConfig(SACConfig):
     """
     Arguments of gSDE-SAC.
 
-    :param use_sde: False: independent noise at each step, and with ``train_freq=1,
-        gradient_steps=1`` plain SAC
-    :param policy_kwargs: ``log_std_init``, ``full_std``, ``use_expln``, ``clip_mean`` and those of
-        every :class:`~sb3_hds.algos.GaussianPolicy`
+    :param use_sde: False: independent noise at each step; with ``train_freq=1, gradient_steps=1``
+        that is plain SAC
+    :param policy_kwargs: ``log_std_init``, ``full_std``, ``use_expln``, ``clip_mean`` and the other
+        arguments of :class:`~sb3_hds.algos.GaussianPolicy`
     """
 
     _: KW_ONLY
@@ -209,13 +208,13 @@ class GSDESAC(SoftActorCritic):
     is redrawn every few steps: smooth, state-dependent exploration that does not wear out motors.
 
     Source: Raffin, Kober and Stulp, *Smooth Exploration for Robotic Reinforcement Learning*, CoRL
-    2021; on Haarnoja et al., *Soft Actor-Critic Algorithms and Applications*, 2018. SBX draws
-    noise that does not depend on the state and reports a deviation of 0; here, the features of the
-    actor, the learned deviations (``log_std_init``, ``full_std``, ``use_expln``), ``clip_mean``,
-    the marginal variance in the log-probability and ``use_sde_at_warmup`` are those of SB3. Unlike
-    SB3, updates draw the noise of each state independently: its distribution is the same, its
-    gradient varies less. Without ``sde_sample_freq``, each collection of ``train_freq`` steps
-    begins with new noise.
+    2021, based on Haarnoja et al., *Soft Actor-Critic Algorithms and Applications*, 2018. The
+    features of the actor, the learned standard deviations (``log_std_init``, ``full_std``,
+    ``use_expln``), ``clip_mean``, the marginal variance in the log-probability and
+    ``use_sde_at_warmup`` are those of SB3; SBX draws noise that does not depend on the state and
+    reports a standard deviation of 0. Unlike SB3, updates draw the noise of each state
+    independently: from the same distribution, with less variance of the gradient. Without
+    ``sde_sample_freq``, each collection of ``train_freq`` steps starts with new noise.
     """
 
     config_class = GSDESACConfig
@@ -227,8 +226,9 @@ class GSDESAC(SoftActorCritic):
 
 def initial_ent_coef(ent_coef: float | str) -> float:
     """
-    :raises ValueError: for anything but a number of at least 0, ``"auto"`` or ``"auto_NUMBER"``,
-        which is above 0
+    :return: the first value of the entropy coefficient
+    :raises ValueError: for anything but a number of at least 0, ``"auto"``, or ``"auto_NUMBER"``
+        with a number above 0
     """
     start: Any = ent_coef
     if isinstance(ent_coef, str):

@@ -18,9 +18,9 @@ class TQCConfig(SACConfig):
     """
     Arguments of TQC.
 
-    :param top_quantiles_to_drop_per_net: times the number of critics: how many of the largest
-        quantiles of all critics together are dropped from the targets
-    :param policy_kwargs: ``n_quantiles`` is 25 unless given; see
+    :param top_quantiles_to_drop_per_net: quantiles per critic that are dropped from the targets,
+        the largest of all critics' pooled quantiles
+    :param policy_kwargs: ``n_quantiles`` is 25 by default; see
         :class:`~sb3_hds.algos.GaussianPolicy`
     """
 
@@ -37,11 +37,11 @@ class TQC(SoftActorCritic):
     Truncated quantile critics.
 
     Source: Kuznetsov et al., *Controlling Overestimation Bias with Truncated Mixture of Continuous
-    Distributional Quantile Critics*, ICML 2020: 25 quantiles, five networks of three layers of 512
-    (``policy_kwargs={"n_critics": 5, "net_arch": {"pi": [256, 256], "qf": [512, 512, 512]}}``), of
-    which 2 quantiles are dropped for each network, none on HalfCheetah, 5 on Hopper; learning
-    starts with the first full batch (``learning_starts=256``). SB3-contrib and SBX use two
-    networks; so does the default here.
+    Distributional Quantile Critics*, ICML 2020: 25 quantiles, five critics of three layers of 512
+    (``policy_kwargs={"n_critics": 5, "net_arch": {"pi": [256, 256], "qf": [512, 512, 512]}}``); 2
+    quantiles per critic are dropped, none on HalfCheetah and 5 on Hopper; learning starts with the
+    first full batch (``learning_starts=256``). The default of two critics is that of SB3-contrib
+    and SBX.
     """
 
     config_class = TQCConfig
@@ -74,10 +74,9 @@ class TQC(SoftActorCritic):
 @dataclasses.dataclass(frozen=True)
 class TruncatedQuantiles:
     """
-    The quantiles of all critics in one pool, without its ``n_dropped * n_critics`` largest (TQC).
-    Which critic these come from does not matter.
+    The pooled quantiles of all critics without the ``n_dropped * n_critics`` largest.
 
-    :param n_dropped: per critic that there is
+    :param n_dropped: dropped quantiles per critic
     """
 
     n_dropped: int
@@ -92,28 +91,28 @@ class TruncatedQuantiles:
 
 def sorted_by_columns(values: Float[Array, "batch n"]) -> Float[Array, "batch n"]:
     """
-    Bitonic network (Batcher 1968) over whole columns, far faster on a CPU than ``jnp.sort`` of as
-    many short rows. A NaN in a row makes NaN of all that it meets.
+    Bitonic sorting network (Batcher 1968) over whole columns, far faster on a CPU than ``jnp.sort``
+    of as many short rows. A NaN in a row spreads to every entry that it is compared with.
     """
     n, columns = values.shape[-1], values.T
     size = 1 << (n - 1).bit_length()
     columns = jnp.pad(columns, ((0, size - n), (0, 0)), constant_values=jnp.inf)
     for run in (2 << i for i in range(size.bit_length() - 1)):
-        # Two sorted runs become one: the second backwards, then ever closer partners.
+        # Merge two sorted runs: reverse the second, then compare partners at halving distances.
         first, second = jnp.split(columns.reshape(size // run, run, -1), 2, 1)
         second = second[:, ::-1]
         low, high = jnp.minimum(first, second), jnp.maximum(first, second)
         columns = jnp.concatenate([low, high[:, ::-1]], 1)
-        apart = run // 4
-        while apart:
-            pairs = columns.reshape(size // (2 * apart), 2, apart, -1)
+        distance = run // 4
+        while distance:
+            pairs = columns.reshape(size // (2 * distance), 2, distance, -1)
             columns = jnp.stack([pairs.min(1), pairs.max(1)], 1)
-            apart //= 2
+            distance //= 2
     return columns.reshape(size, -1)[:n].T
 
 
 def sorted_by_rows(values: Float[Array, "batch n"]) -> Float[Array, "batch n"]:
-    """``jnp.sort``, which puts a NaN last, where it might be left out: it makes NaN of its row."""
+    """``jnp.sort``, but a NaN makes its whole row NaN: sorted last, it might be dropped."""
     unknown = jnp.isnan(values).any(-1, keepdims=True)
     return jnp.where(unknown, jnp.nan, jnp.sort(values, -1))
 
@@ -121,11 +120,12 @@ def sorted_by_rows(values: Float[Array, "batch n"]) -> Float[Array, "batch n"]:
 @jax.custom_jvp
 def quantile_huber(values: Values, targets: Targets) -> Loss:
     """
-    Mean over quantiles, targets and batch, summed over critics (Dabney et al. 2018). Targets count
-    as constants: no gradient reaches them.
+    Quantile Huber loss: mean over quantiles, targets and batch, summed over critics (Dabney et al.
+    2018). Targets are constants: they receive no gradient.
 
-    Reverse mode would keep every pair of a quantile and a target; here, slopes are summed up beside
-    the loss.
+    Reverse mode would store every pair of a quantile and a target; here, the slope is computed with
+    the loss. Sorting and loss are written twice: a CPU walks through memory once, while on an
+    accelerator, where every operation waits for the previous one, fewer operations are faster.
     """
     return _with_slope(values, targets)[0]
 
@@ -137,7 +137,7 @@ def _(primals: tuple[Values, Targets], tangents: tuple[Values, Targets]) -> tupl
 
 
 def _with_slope(values: Values, targets: Targets) -> tuple[Loss, Values]:
-    """:return: the loss, and its slope in the values"""
+    """:return: the loss and its derivative by the values"""
     loss, slope = jax.lax.platform_dependent(
         values, targets, cpu=target_by_target, default=all_targets
     )
@@ -146,7 +146,7 @@ def _with_slope(values: Values, targets: Targets) -> tuple[Loss, Values]:
 
 
 def target_by_target(values: Values, targets: Targets) -> tuple[Values, Values]:
-    """:return: losses and slopes of the values, summed over targets"""
+    """:return: losses and slopes of the values, summed over targets one by one (CPU)"""
 
     def add(sums: tuple[Values, Values], target: Float[Array, " batch"]) -> tuple[Any, None]:
         loss, slope = _of_pairs(values, target[:, None])
@@ -157,14 +157,14 @@ def target_by_target(values: Values, targets: Targets) -> tuple[Values, Values]:
 
 
 def all_targets(values: Values, targets: Targets) -> tuple[Values, Values]:
-    """:return: as ``target_by_target``, all pairs in one operation"""
+    """:return: as ``target_by_target``, from all pairs at once (accelerators)"""
     one = jax.vmap(_of_pairs, (None, -1), -1)
     loss, slope = one(values, targets[:, None])
     return jnp.sum(loss, -1), jnp.sum(slope, -1)
 
 
 def _of_pairs(values: Values, target: Float[Array, "batch #values"]) -> tuple[Values, Values]:
-    """:return: loss and slope of each value with one target of each row"""
+    """:return: loss and slope of each value for one target per row"""
     n = values.shape[-1]
     level = (jnp.arange(n) + 0.5) / n
     delta = target - values
