@@ -197,8 +197,9 @@ class Optimizer:
     make: Callable[..., optax.GradientTransformation]
     arguments: tuple[tuple[str, Any], ...] = ()
 
-    def init(self, params: Any) -> Any:
-        return self._transformation.init(params)
+    def train_state(self, weights: Weights) -> TrainState:
+        """:return: the network with the initial state of its optimiser"""
+        return TrainState(weights, self._transformation.init(weights["params"]))
 
     def apply(self, gradient: Any, trained: TrainState, rate: Any) -> TrainState:
         """:return: the network and the optimiser after a step with this learning rate"""
@@ -243,7 +244,7 @@ def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -
         )
     optimizer = Optimizer(found or make, tuple(sorted(arguments.items())))  # type: ignore[arg-type]
     try:
-        optimizer.init({"w": jnp.zeros(1)})
+        optimizer.train_state({"params": jnp.zeros(1)})
     except TypeError as error:
         raise ValueError(f"optimizer_kwargs {arguments!r} do not fit {name}: {error}.") from None
     return optimizer

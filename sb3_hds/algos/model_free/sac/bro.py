@@ -247,9 +247,9 @@ class OptimisticActor:
         n_act = cast(Any, self.network).n_act
         weights = self.network.init(key, obs, jnp.zeros((1, n_act)))
         multipliers = {"optimism": _INITIAL_OPTIMISM, "regularizer": _INITIAL_REGULARIZER}
-        fresh = {name: {"params": _before(math.log(start))} for name, start in multipliers.items()}
-        return {"actor": TrainState(weights, self.optimizer.init(weights["params"]))} | {
-            name: TrainState(raw, _MULTIPLIER.init(raw["params"])) for name, raw in fresh.items()
+        return {"actor": self.optimizer.train_state(weights)} | {
+            name: _MULTIPLIER.train_state({"params": _before(math.log(start))})
+            for name, start in multipliers.items()
         }
 
     def update(

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from sb3_hds.algos.nets.options import Activation
 
-_FEW = 8
+_FEW = 8  # inputs up to which a product of hidden layers is summed column by column
 
 
 def product(x: Float[Array, "*batch n"], kernel: Float[Array, "n m"]) -> Float[Array, "*batch m"]:
@@ -30,48 +30,33 @@ def hidden_product(
     return _of_few(x, kernel) if kernel.shape[0] <= _FEW else product(x, kernel)
 
 
-def _dense(product: Callable[[Array, Array], Array]) -> type[nn.Dense]:
-    def dot_general(x: Array, kernel: Array, _: Any, precision: Any = None) -> Array:
-        return product(x, kernel)
-
-    layer: Any = partial(nn.Dense, dot_general=dot_general)
-    return layer
+def _dense(product: Callable[[Array, Array], Array]) -> Any:
+    return partial(nn.Dense, dot_general=lambda x, kernel, *_, **__: product(x, kernel))
 
 
 # Layers of flax, with these.
 Hidden, Last = map(_dense, (hidden_product, product))
 
 
-@jax.custom_vjp
-def _to_one(x: Array, kernel: Array) -> Array:
-    return x @ kernel
+def _with_slopes(primal: Callable, slope_of_x: Callable) -> Callable[[Array, Array], Array]:
+    """:return: the product of rows and a kernel, with a derivative in reverse mode only"""
+    product = jax.custom_vjp(primal)
+
+    def backward(seen: tuple[Array, Array], slope: Array) -> tuple[Array, Array]:
+        x, kernel = seen
+        rows = [part.reshape(-1, part.shape[-1]) for part in (x, slope)]
+        return slope_of_x(slope, kernel), rows[0].T @ rows[1]
+
+    product.defvjp(lambda x, kernel: (product(x, kernel), (x, kernel)), backward)
+    return product
 
 
-@jax.custom_vjp
-def _of_few(x: Array, kernel: Array) -> Array:
-    columns = jnp.split(x, len(kernel), -1)
-    return reduce(jnp.add, map(jnp.multiply, columns, kernel))
+def _by_columns(x: Array, kernel: Array) -> Array:
+    return reduce(jnp.add, map(jnp.multiply, jnp.split(x, len(kernel), -1), kernel))
 
 
-def _to_one_back(seen: tuple[Array, Array], slope: Array) -> tuple[Array, Array]:
-    x, kernel = seen
-    return slope * kernel[:, 0], _of_kernel(x, slope)
-
-
-def _of_few_back(seen: tuple[Array, Array], slope: Array) -> tuple[Array, Array]:
-    x, kernel = seen
-    return slope @ kernel.T, _of_kernel(x, slope)
-
-
-def _of_kernel(x: Array, slope: Array) -> Array:
-    rows = [part.reshape(-1, part.shape[-1]) for part in (x, slope)]
-    return rows[0].T @ rows[1]
-
-
-_to_one.defvjp(lambda x, kernel: (_to_one(x, kernel), (x, kernel)), _to_one_back)
-
-
-_of_few.defvjp(lambda x, kernel: (_of_few(x, kernel), (x, kernel)), _of_few_back)
+_to_one = _with_slopes(lambda x, kernel: x @ kernel, lambda slope, kernel: slope * kernel[:, 0])
+_of_few = _with_slopes(_by_columns, lambda slope, kernel: slope @ kernel.T)
 
 
 def orthogonal(gain: float) -> nn.initializers.Initializer:
@@ -320,10 +305,8 @@ class ExploringActor(nn.Module):
             mean = jnp.clip(mean, -self.clip_mean, self.clip_mean)
         shape = (latent.shape[-1], self.n_act if self.full_std else 1)
         log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), shape)
-        std = exploration_std(log_std, self.use_expln)
-        return Gaussian(
-            mean, marginal_std(latent, jnp.broadcast_to(std, (shape[0], self.n_act))), latent
-        )
+        std = jnp.broadcast_to(exploration_std(log_std, self.use_expln), (shape[0], self.n_act))
+        return Gaussian(mean, marginal_std(latent, std), latent)
 
 
 class Critic(nn.Module):

@@ -123,7 +123,6 @@ class Extra(Protocol):
         self, config: UpdateConfig, state: SACState, batch: Batch, hyper: Hyperparams, key: Any
     ) -> Any:
         """:return: its state after an update of the actor"""
-        ...
 
     def explore(self, state: Any, obs: Array, gaussian: Gaussian, noise: Array) -> Array:
         """
@@ -131,7 +130,6 @@ class Extra(Protocol):
         :param noise: deviation from the actor's mean, before tanh
         :return: exploratory actions
         """
-        ...
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICK_COMPILATION)
@@ -144,14 +142,11 @@ def init_state(
     actor = config.actor.init(actor_key, obs)
     init = lambda key: config.critic.init({"params": key, "dropout": key}, obs, action)  # noqa: E731
     critic = jax.vmap(init)(jax.random.split(critic_key, config.n_critics))
-    log_ent_coef = {"params": log_of(ent_coef)}
     return SACState(
-        actor=TrainState(actor, config.optimizer.init(actor["params"])),
-        critic=TrainState(critic, config.qf_optimizer.init(critic["params"])),
+        actor=config.optimizer.train_state(actor),
+        critic=config.qf_optimizer.train_state(critic),
         target={} if config.joint_pass else critic,
-        log_ent_coef=TrainState(
-            log_ent_coef, config.ent_coef_optimizer.init(log_ent_coef["params"])
-        ),
+        log_ent_coef=config.ent_coef_optimizer.train_state({"params": log_of(ent_coef)}),
         obs_stats=RunningStats.empty(n_obs),
         extra=config.extra.init(actor, obs, extra_key) if config.extra else {},
         key=key,
@@ -203,11 +198,10 @@ def update_once(
         )
     critics = partial(update_critics, config, batch, hyper)
     actor = partial(update_actor, config, batch, hyper)
-    target = partial(soft_update, hyper.tau)
     steps = [
         UpdateStep(("critic",), 1, critics),
         UpdateStep(("actor", "log_ent_coef", "extra"), config.policy_delay, actor),
-        UpdateStep(("target",), config.target_update_interval, target),
+        UpdateStep(("target",), config.target_update_interval, partial(soft_update, hyper.tau)),
     ]
     return apply_schedule(state, metrics, *steps[: 2 if config.joint_pass else 3])
 

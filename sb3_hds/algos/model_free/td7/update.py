@@ -122,9 +122,9 @@ def init_state(config: UpdateConfig, n_obs: int, n_act: int, key: PRNGKeyArray) 
     zero = jnp.zeros(())
     infinite = jnp.full_like(zero, jnp.inf)
     return TD7State(
-        encoder=TrainState(encoder, config.qf_optimizer.init(encoder["params"])),
-        actor=TrainState(actor, config.optimizer.init(actor["params"])),
-        critic=TrainState(critic, config.qf_optimizer.init(critic["params"])),
+        encoder=config.qf_optimizer.train_state(encoder),
+        actor=config.optimizer.train_state(actor),
+        critic=config.qf_optimizer.train_state(critic),
         copies=Copies(encoder, actor, critic, encoder),
         checkpoint=Checkpoint(encoder, actor, zero),
         clip=Range(zero, zero),
