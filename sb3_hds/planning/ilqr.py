@@ -18,10 +18,10 @@ _LEAST_CURVATURE = 1e-4
 
 class Gains(NamedTuple):
     """
-    The minimiser of a local model.
+    The policy that minimises a local model.
 
     :param feedforward: change of the controls, shape ``(horizon, m)``
-    :param feedback: reaction to a change of the state, shape ``(horizon, m, n)``
+    :param feedback: gain on a change of the state, shape ``(horizon, m, n)``
     :param sensitivity: cost of an error in this control, ``|Q_u| + tr(Q_uu) / 2``, shape
         ``(horizon,)``
     """
@@ -35,19 +35,18 @@ def solve_backward(
     expansion: Expansion, controls: Controls, regularisation: Scalar | float, bounded: bool = True
 ) -> Gains:
     r"""
-    Minimise the local model from the last step to the first:
+    Minimise the local model by a Riccati recursion from the last step to the first:
 
     .. math:: Q_z = \ell_z + [A\,B]^\top V_x', \quad
               Q_{zz} = \ell_{zz} + [A\,B]^\top V_{xx}' [A\,B], \quad
               k = -Q_{uu}^{-1} Q_u, \quad K = -Q_{uu}^{-1} Q_{ux}
 
     :math:`Q_{uu}` is made positive definite by raising pivots of its factorisation. With
-    ``bounded``, controls that stand at a limit and want beyond it are held there and do not react
-    to the state.
+    ``bounded``, controls at a limit whose optimum is beyond it stay there, without feedback.
 
-    :param controls: where the model was expanded
+    :param controls: around which the model was expanded
     :param regularisation: added to the diagonal of :math:`Q_{uu}`
-    :param bounded: whether the box [-1, 1] is respected
+    :param bounded: whether to respect the box [-1, 1]
 
     Source: Tassa, Mansard, Todorov, *Control-limited differential dynamic programming*, ICRA 2014,
     with one clamping step instead of the full projected Newton iteration.
@@ -85,7 +84,7 @@ def _solve(
     free: Bool[Array, " m"],
     regularisation: Scalar | float,
 ) -> Float[Array, "m k"]:
-    """Solve for the free controls; the held ones get zero."""
+    """Solve for the free controls; the others get zero."""
     both = free[:, None] & free[None, :]
     matrix = jnp.where(both, q_uu, 0.0) + jnp.diag(jnp.where(free, regularisation, 1.0))
     return solve_spd(matrix, jnp.where(free[:, None], right, 0.0), _LEAST_CURVATURE)
@@ -106,16 +105,16 @@ def ilqr(
     .. math:: u_t \leftarrow \mathrm{clip}(u_t + \alpha\,k_t + K_t\,(x_t - \bar x_t), -1, 1)
 
     The step size is searched in the simulator, "no change" included: without temperature the
-    objective never falls. Regularisation grows tenfold after a useless iteration and shrinks
-    tenfold after a useful one. Only forward-mode derivatives of one step are needed.
+    objective never falls. Regularisation grows tenfold after an iteration without improvement and
+    shrinks tenfold after one with. Only forward-mode derivatives of single steps are needed.
 
-    :param start: where the plan starts
+    :param start: initial state of the plan
     :param first: what to improve: controls of shape ``(horizon, n_act)``, or a plan from ``start``
-    :param n_iterations: expansions computed
+    :param n_iterations: number of expansions
     :param n_step_sizes: candidates of each line search
     :param temperature: annealed acceptance, see :func:`~sb3_hds.planning.line_search.choose`
     :param key: needed with a temperature
-    :return: the plan, and the gains of the last iteration, around the plan before it
+    :return: the plan, and the gains of the last iteration, which belong to the plan before it
     """
     first = simulated(problem, start, first)
     dtype = first.controls.dtype
@@ -147,15 +146,14 @@ def gauss_newton(
     key: PRNGKeyArray | None = None,
 ) -> Plan:
     r"""
-    The paper's second-order step on the whole action sequence: :math:`a \leftarrow a + \alpha
-    H^{-1} g` with
-    :math:`H = S^\top \ell_{ss} S + \ell_{aa}`, :math:`S = \partial s / \partial a`.
+    The paper's second-order step on the full action sequence: :math:`a \leftarrow a + \alpha H^{-1}
+    g` with :math:`H = S^\top \ell_{ss} S + \ell_{aa}`, :math:`S = \partial s / \partial a`.
 
-    The step is found by the Riccati recursion, which gives the same :math:`H^{-1} g` at a cost
-    linear in the horizon; curvature that is not positive is raised. It ends as controls without
-    feedback, as in the paper, clipped to the limits. "No change" is among the step sizes.
+    A Riccati recursion computes :math:`H^{-1} g` at a cost linear in the horizon; curvature that is
+    not positive is raised. As in the paper, the result is open-loop controls, clipped to the
+    limits. "No change" is among the step sizes.
 
-    :param start: where the plan starts
+    :param start: initial state of the plan
     :param first: what to improve: controls of shape ``(horizon, n_act)``, or a plan from ``start``
     :param n_iterations: steps taken
     :param n_step_sizes: candidates of each line search, from 1 down to 5e-4
@@ -185,7 +183,7 @@ def newton_direction(problem: Problem, plan: Plan) -> Controls:
 
 
 def _follow(problem: Problem, start: State, plan: Plan, gains: Gains, step: Scalar) -> Plan:
-    """Roll out the plan with a share of its change, and feedback; a step of 0 changes nothing."""
+    """Roll out the plan with ``step`` times its change, and feedback; 0 changes nothing."""
     reference = jax.tree.map(lambda leaf: leaf[:-1], plan.states)
     feedback = jnp.where(step > 0.0, gains.feedback, 0.0)
 

@@ -1,4 +1,4 @@
-"""Line searches, with "no change" among the candidates."""
+"""Line searches, with "no change" among the candidates, and gradient ascent by them (PODS)."""
 
 import math
 from collections.abc import Callable
@@ -14,8 +14,8 @@ from sb3_hds.planning.problem import Controls, Plan, Problem, simulate, simulate
 
 def step_sizes(n: int, smallest: float = 0.015) -> tuple[float, ...]:
     """
-    :param n: how many, "no change" included; at least 2
-    :param smallest: smallest step other than zero
+    :param n: number of step sizes, "no change" included; at least 2
+    :param smallest: smallest step size other than zero
     :return: zero and ``n - 1`` steps from 1 down to ``smallest``, geometrically spaced
     """
     if n < 2:
@@ -31,13 +31,14 @@ def choose(
     values: Float[Array, " candidates"], temperature: Scalar | float, key: PRNGKeyArray | None
 ) -> Int[Array, ""]:
     r"""
-    The candidate to take. Without temperature, the best; the first among equals, so that a useless
-    step is not taken. With temperature, candidate i with probability :math:`\propto \exp(J_i / T)`
-    (Boltzmann acceptance of simulated annealing, drawn by the Gumbel trick).
+    Choose a candidate: without temperature, the best, the first among equals, so that no useless
+    step is taken; with temperature, candidate i with probability :math:`\propto \exp(J_i / T)`
+    (Boltzmann acceptance of simulated annealing, sampled by the Gumbel trick).
 
-    :param values: objectives; minus infinity marks what must not be taken
-    :param temperature: :math:`T`, in the units of the objective; 0 is a plain maximum
-    :param key: needed where the temperature may be positive
+    :param values: objectives; candidates with minus infinity are never chosen
+    :param temperature: :math:`T`, in units of the objective; 0: the maximum
+    :param key: needed if the temperature may be positive
+    :return: index of the candidate
     """
     if key is None:
         return jnp.argmax(values)
@@ -56,7 +57,7 @@ def climb(
     key: PRNGKeyArray | None,
 ) -> Plan:
     """
-    Iterate line searches along a direction of the whole control sequence, clipped to the limits.
+    Iterate line searches along a direction of the full control sequence, clipped to the limits.
 
     :param direction: change of the controls for a unit step, zero where it is not finite
     :param n_step_sizes: candidates of each line search, "no change" and steps from 1 down to 5e-4
@@ -78,7 +79,7 @@ def climb(
 
 def control_gradient(expansion: Expansion) -> Controls:
     r"""
-    Gradient of the objective by every control, by the adjoint recursion
+    Gradient of the objective with respect to every control, by the adjoint recursion
 
     .. math:: \lambda_t = \ell_x + A_t^\top \lambda_{t+1}, \qquad
               \partial J / \partial u_t = -(\ell_u + B_t^\top \lambda_{t+1})
@@ -105,14 +106,14 @@ def gradient_ascent(
     key: PRNGKeyArray | None = None,
 ) -> Plan:
     r"""
-    Move all controls along the gradient, scaled so that the largest change of a unit step is one:
+    Move all controls along the gradient, scaled so that a unit step changes them by at most one:
 
     .. math:: u \leftarrow \mathrm{clip}(u + \alpha\, g / \max|g|, -1, 1)
 
     The step size :math:`\alpha` is searched in the simulator, "no change" included: without
     temperature the objective never falls. A gradient that is not finite counts as zero.
 
-    :param start: where the plan starts
+    :param start: initial state of the plan
     :param first: what to improve: controls of shape ``(horizon, n_act)``, or a plan from ``start``
     :param n_iterations: gradients taken
     :param n_step_sizes: candidates of each line search, from 1 down to 5e-4

@@ -1,4 +1,4 @@
-"""One planner over many start states, compiled."""
+"""Uses of an improver: many start states, several warm starts, growing horizons, replanning."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -44,8 +44,8 @@ def solve(
     :param terminal_value: of the last observation; the same function object compiles only once
     :param terminal_curvature: whether second-order methods use its Hessian
     :param temperature: annealed acceptance; needs ``key``
-    :return: plans, leaves of shape ``(batch, ...)``; a sequence that meets a value that is not
-        finite keeps its best finite form, the others are not touched by it
+    :return: plans, leaves of shape ``(batch, ...)``; a sequence with values that are not finite
+        keeps its best finite version and does not affect the others
     :raises ValueError: for an unknown method or controls of the wrong shape
     """
     if method not in METHODS:
@@ -81,13 +81,13 @@ _KNOTS = 5
 
 def random_controls(key: PRNGKeyArray, horizon: int, n_act: int, scale: float = 2.0) -> Controls:
     """
-    Piecewise linear through five normal knots, clipped: smooth, and often at a limit.
+    Random sequence, piecewise linear through five normal knots and clipped: smooth, often at a
+    limit.
 
     :param scale: standard deviation of the knots; above 1, much of the sequence is bang-bang
     """
     knots = scale * jax.random.normal(key, (_KNOTS, n_act))
-    # The weights of the knots are constants: interpolating inside the program takes a second to
-    # compile.
+    # Constant weights of the knots: interpolation inside the program takes a second to compile.
     distance = np.abs(np.linspace(0.0, _KNOTS - 1.0, horizon)[:, None] - np.arange(_KNOTS))
     hats = jnp.asarray(np.maximum(1.0 - distance, 0.0), knots.dtype)
     return jnp.clip(hats @ knots, -1.0, 1.0)
@@ -132,14 +132,12 @@ def horizon_continuation(
     improve: Callable[[Problem, State, Controls], Plan],
 ) -> Plan:
     """
-    Improve the first steps, then more and more of them: a long swing-up is found from its
-    beginning.
+    Improve the first steps of a sequence, then growing parts of it, as for a long swing-up.
 
-    :param controls: the whole sequence, shape ``(horizon, n_act)``
-    :param horizons: growing lengths; the last one is the whole horizon
+    :param controls: the sequence, shape ``(horizon, n_act)``
+    :param horizons: growing lengths; the last one is the full horizon
     :param improve: an improver, for example ``gauss_newton``
-    :return: the plan over the whole horizon; never worse than the start, which is kept if it is
-        better
+    :return: the plan over the full horizon, or that of ``controls`` if it is better
     """
     if (
         list(horizons) != sorted(set(horizons))
@@ -168,15 +166,16 @@ def receding_horizon(
     replan_every: int = 1,
 ) -> Plan:
     """
-    Plan ``horizon`` steps, carry out the first ``replan_every``, shift the plan, plan again.
+    Model-predictive control in the twin: plan over ``horizon`` steps, execute the first
+    ``replan_every``, shift the plan, replan.
 
-    The shifted plan is the warm start of the next one; its last control is repeated.
+    The shifted plan, with its last control repeated, is the next warm start.
 
-    :param n_steps: steps to act in all; a multiple of ``replan_every``
+    :param n_steps: number of executed steps; a multiple of ``replan_every``
     :param initial: first warm start; its length is the planning horizon
     :param improve: an improver, for example ``gauss_newton``
     :param replan_every: steps between two plans, at most the horizon
-    :return: what was carried out, ``n_steps`` long, scored as a plan of its own
+    :return: the executed steps as a plan of length ``n_steps``
     """
     horizon = initial.shape[0]
     if not 1 <= replan_every <= horizon or n_steps % replan_every:

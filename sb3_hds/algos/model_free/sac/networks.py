@@ -1,4 +1,10 @@
-"""What lies between the input of an actor or a critic and its last layer."""
+r"""
+Networks of the SAC family: hidden layers, and actors and critics on top of them.
+
+The Gaussian before :math:`\tanh` and gSDE follow SB3's ``SquashedDiagGaussianDistribution`` and
+``StateDependentNoiseDistribution`` (:math:`\log(1 - a^2 + 10^{-6})` rather than the limit), so that
+log-probabilities agree.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -13,10 +19,18 @@ from jaxtyping import Array, Float
 from sb3_hds.algos.nets.options import Activation
 
 _FEW = 8  # inputs up to which a product of hidden layers is summed column by column
+_EPSILON = 1e-6
+_LOG_SQRT_TAU = 0.5 * math.log(2.0 * math.pi)
+# Range of ``log_std``: where it is clipped (SAC), and where it is squashed (SimBa, BRO).
+_CLIPPED, _SQUASHED = (-20.0, 2.0), (-10.0, 2.0)
+# Limits of BatchRenorm (Ioffe 2017, section 3), and the floor of the variance in SBX's CrossQ.
+_R_MAX, _D_MAX, _RENORM_EPSILON = 3.0, 5.0, 1e-3
+#: flax's default initialiser of kernels
+USUAL = nn.initializers.lecun_normal()
 
 
 def product(x: Float[Array, "*batch n"], kernel: Float[Array, "n m"]) -> Float[Array, "*batch m"]:
-    """:return: ``x @ kernel``, without a derivative in forward mode where ``m`` is 1"""
+    """:return: ``x @ kernel``; no forward-mode derivative where ``m`` is 1"""
     return _to_one(x, kernel) if kernel.shape[1] == 1 else x @ kernel
 
 
@@ -24,8 +38,8 @@ def hidden_product(
     x: Float[Array, "*batch n"], kernel: Float[Array, "n m"]
 ) -> Float[Array, "*batch m"]:
     """
-    :return: the same; of few inputs, it may be computed more than once, and rounded otherwise, so
-        that it must not be compared with itself (the slope of a maximum is)
+    :return: ``x @ kernel``; with few inputs, XLA may compute it twice with different rounding, so
+        it must not be compared with itself, as in the derivative of a maximum
     """
     return _of_few(x, kernel) if kernel.shape[0] <= _FEW else product(x, kernel)
 
@@ -34,7 +48,7 @@ def _dense(product: Callable[[Array, Array], Array]) -> Any:
     return partial(nn.Dense, dot_general=lambda x, kernel, *_, **__: product(x, kernel))
 
 
-# Layers of flax, with these.
+# Dense layers of flax with these products.
 Hidden, Last = map(_dense, (hidden_product, product))
 
 
@@ -61,11 +75,10 @@ _of_few = _with_slopes(_by_columns, lambda slope, kernel: slope @ kernel.T)
 
 def orthogonal(gain: float) -> nn.initializers.Initializer:
     """
-    Flax's ``orthogonal``, one kernel after the other under ``vmap``: jaxlib 0.10 hands the
-    decompositions of a batch to the pool that runs the program and waits for them there, and a
-    program in which as many wait as the pool has threads never ends.
+    Flax's ``orthogonal``, sequential under ``vmap``: jaxlib 0.10 runs a batch of decompositions in
+    the thread pool of the program and waits for them there, a deadlock if all threads wait.
 
-    :param gain: what an orthogonal kernel is multiplied by
+    :param gain: factor on the orthogonal kernel
     """
     draw = nn.initializers.orthogonal(gain)
 
@@ -75,27 +88,24 @@ def orthogonal(gain: float) -> nn.initializers.Initializer:
     return init
 
 
-#: where kernels start, with gains of the square root of 2 and of 1
+#: orthogonal initialisers with gains of the square root of 2 and of 1
 ORTHOGONAL, ORTHONORMAL = orthogonal(math.sqrt(2)), orthogonal(1.0)
 _HE = nn.initializers.he_normal()
-# BatchRenorm's limits (Ioffe 2017, section 3), and the variance's floor in SBX's CrossQ.
-_R_MAX, _D_MAX, _RENORM_EPSILON = 3.0, 5.0, 1e-3
 
 
 class Mlp(nn.Module):
     """
-    Dense layers, each followed by dropout, layer norm or batch renormalisation as asked, and the
-    activation.
+    Dense layers with activations and optional dropout, layer norm and batch normalisation.
 
-    :param net_arch: their widths
-    :param activation_fn: after each
-    :param dropout_rate: DroQ's; 0: none
+    :param net_arch: widths of the layers
+    :param activation_fn: of each layer
+    :param dropout_rate: DroQ's; 0: no dropout
     :param layer_norm: DroQ's, after the dropout
     :param renorm_warmup_steps: CrossQ's: updates of plain batch normalisation before batch
-        renormalisation; None: neither of them
-    :param momentum: of its running statistics
-    :param ortho_init: whether kernels start orthogonal, with a gain of the square root of 2, rather
-        than normal, with a gain of 1
+        renormalisation; None: neither
+    :param momentum: of the running statistics of batch normalisation
+    :param ortho_init: whether kernels start orthogonal with a gain of the square root of 2, rather
+        than normal with a gain of 1
     """
 
     net_arch: Sequence[int]
@@ -108,7 +118,7 @@ class Mlp(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
-        kernels = ORTHOGONAL if self.ortho_init else nn.initializers.lecun_normal()
+        kernels = ORTHOGONAL if self.ortho_init else USUAL
         if self.renorm_warmup_steps is not None:
             x = BatchRenorm(self.renorm_warmup_steps, self.momentum)(x, train)
         for width in self.net_arch:
@@ -123,13 +133,13 @@ class Mlp(nn.Module):
 
 class SimbaNet(nn.Module):
     """
-    Residual blocks on a linear path: layer norm, a layer four times as wide, and back.
+    Residual blocks of layer norm, a layer four times as wide, and one of the block's width.
 
     Source: Lee et al., *SimBa: Simplicity Bias for Scaling Up Parameters in Deep Reinforcement
     Learning*, ICLR 2025, section 4.
 
-    :param net_arch: width of each block; where it changes, a dense layer leads to the next; none:
-        the input itself
+    :param net_arch: width of each block; a dense layer precedes a block of another width; empty:
+        the identity
     :param activation_fn: inside a block
     :param dropout_rate: after each block, as in SBX
     """
@@ -151,14 +161,14 @@ class SimbaNet(nn.Module):
 
 class Dropout(nn.Module):
     """
-    Zeroes each entry with the probability ``rate`` and scales the others up; always on, as in
-    DroQ, where the mask is what makes an ensemble of two critics behave like one of many.
+    Zero each entry with probability ``rate`` and scale the others up; always on, as in DroQ, where
+    masks make an ensemble of two critics behave like a larger one.
 
-    Half of an update of DroQ is spent on JAX's counter-based random bits. Masks need no such
-    quality: here, two words of the key are mixed with each entry's index (the finaliser of
-    MurmurHash3, A. Appleby, public domain).
+    JAX's counter-based random bits would take half of the time of an update of DroQ. Masks do not
+    need their quality: here, two words of the key are mixed with the index of each entry (finaliser
+    of MurmurHash3, A. Appleby, public domain).
 
-    :param rate: 0: nothing is zeroed
+    :param rate: 0: no dropout
     """
 
     rate: float
@@ -176,11 +186,11 @@ class Dropout(nn.Module):
 
 class BatchRenorm(nn.Module):
     """
-    Batch normalisation for ``warmup`` updates, then batch renormalisation: by the batch, corrected
-    towards the running statistics. Where not training, by the running statistics.
+    Batch normalisation for ``warmup`` updates, then batch renormalisation: statistics of the batch,
+    corrected towards the running ones. Outside training, the running statistics.
 
-    Source: Ioffe, *Batch Renormalization*, NeurIPS 2017; with a step in the place of the slow
-    relaxation of its limits, as CrossQ (Bhatt et al., ICLR 2024) has it.
+    Source: Ioffe, *Batch Renormalization*, NeurIPS 2017, whose limits are relaxed in one step
+    instead of slowly, as in CrossQ (Bhatt et al., ICLR 2024).
 
     :param warmup: updates of plain batch normalisation
     :param momentum: of the running statistics
@@ -221,22 +231,13 @@ def _mixed(word: jax.Array) -> jax.Array:
     return word ^ (word >> 16)
 
 
-_EPSILON = 1e-6
-_LOG_SQRT_TAU = 0.5 * math.log(2.0 * math.pi)
-# Of the logarithm of the deviation of actions: where it is clipped (SAC), and where it is squashed.
-_CLIPPED, _SQUASHED = (-20.0, 2.0), (-10.0, 2.0)
-#: where last layers start, as flax has them
-USUAL = nn.initializers.lecun_normal()
-
-
 class Gaussian(NamedTuple):
-    """
-    Of the action before :math:`\tanh`.
+    r"""
+    Distribution of the action before :math:`\tanh`.
 
     :param mean: shape ``(*batch, act)``
-    :param std: its marginal standard deviation, of the same shape
-    :param latent: what state-dependent exploration multiplies its noise matrix by, shape
-        ``(*batch, latent)``
+    :param std: marginal standard deviation, shape ``(*batch, act)``
+    :param latent: features that gSDE multiplies by its noise matrix, shape ``(*batch, latent)``
     """
 
     mean: Float[Array, "*batch act"]
@@ -246,15 +247,15 @@ class Gaussian(NamedTuple):
 
 class GaussianActor(nn.Module):
     r"""
-    Maps an observation to a Gaussian whose standard deviation has an output layer of its own.
+    Map an observation to a Gaussian whose standard deviation has its own output layer.
 
-    :param body: see ``mlp.py``
-    :param n_act: number of controls
-    :param squash_log_std: whether :math:`\tanh` squashes the logarithm of the deviation into
-        [-10, 2], as in ``NormalTanhPolicy`` of the authors' code of SimBa and BRO, so that it
-        starts near -4; otherwise, it is clipped to [-20, 2] and starts near 0
-    :param of_mean: draws the kernel of the mean
-    :param of_std: draws that of the logarithm of the deviation
+    :param body: hidden layers, such as :class:`Mlp`
+    :param n_act: number of actions
+    :param squash_log_std: whether :math:`\tanh` squashes ``log_std`` into [-10, 2], as in
+        ``NormalTanhPolicy`` of the authors' code of SimBa and BRO, so that it starts near -4;
+        otherwise, it is clipped to [-20, 2] and starts near 0
+    :param of_mean: initialiser of the kernel of the mean
+    :param of_std: initialiser of the kernel of ``log_std``
     """
 
     body: nn.Module
@@ -277,16 +278,16 @@ class GaussianActor(nn.Module):
 
 class ExploringActor(nn.Module):
     r"""
-    Maps an observation to a Gaussian with the standard deviation of :math:`\theta^T z` over noise
+    Map an observation to a Gaussian with the standard deviation of :math:`\theta^T z` over noise
     matrices :math:`\theta` (generalised state-dependent exploration).
 
-    :param body: its output is :math:`z`
-    :param n_act: number of controls
-    :param log_std_init: where the logarithm of the matrix's standard deviation starts
-    :param full_std: whether each pair of feature and control has its own, or each feature
-    :param use_expln: see :func:`sb3_hds.algos.model_free.sac.networks.exploration_std`
-    :param clip_mean: the mean is clipped to this, which helps where :math:`\tanh` saturates; 0: not
-    :param of_mean: draws the kernel of the mean
+    :param body: hidden layers, whose output is :math:`z`
+    :param n_act: number of actions
+    :param log_std_init: initial ``log_std`` of the noise matrix
+    :param full_std: one ``log_std`` per feature and action instead of one per feature
+    :param use_expln: see :func:`exploration_std`
+    :param clip_mean: limit of the mean, which helps where :math:`\tanh` saturates; 0: no limit
+    :param of_mean: initialiser of the kernel of the mean
     """
 
     body: nn.Module
@@ -311,11 +312,11 @@ class ExploringActor(nn.Module):
 
 class Critic(nn.Module):
     """
-    Observation and action to values.
+    Map observation and action to values.
 
-    :param body: see ``mlp.py``
+    :param body: hidden layers, such as :class:`Mlp`
     :param n_values: 1, or the number of quantiles
-    :param of_values: draws their kernel
+    :param of_values: initialiser of the last kernel
     """
 
     body: nn.Module
@@ -336,7 +337,7 @@ class Critic(nn.Module):
 def noise_std(actor: ExploringActor, weights: dict) -> Float[Array, "latent act"]:
     """
     :param weights: of the actor
-    :return: standard deviation of the entries of its noise matrix
+    :return: standard deviation of each entry of its noise matrix
     """
     log_std = weights["params"]["log_std"]
     wide = jnp.broadcast_to(log_std, (log_std.shape[0], actor.n_act))
@@ -346,16 +347,16 @@ def noise_std(actor: ExploringActor, weights: dict) -> Float[Array, "latent act"
 def squashed_between(
     raw: Float[Array, "*shape"], low: float, high: float
 ) -> Float[Array, "*shape"]:
-    r""":return: :math:`\tanh` of it, moved and scaled from (-1, 1) to those limits"""
+    r""":return: :math:`\tanh` of ``raw``, scaled from (-1, 1) to the limits"""
     return low + 0.5 * (high - low) * (1.0 + jnp.tanh(raw))
 
 
 def log_probability(
     gaussian: Gaussian, before: Float[Array, "*batch act"]
 ) -> Float[Array, "*batch"]:
-    """
+    r"""
     :param before: actions before :math:`\tanh`
-    :return: log-density of the actions after it
+    :return: log-density of the actions after :math:`\tanh`
     """
     scaled = (before - gaussian.mean) / gaussian.std
     density = -0.5 * scaled**2 - jnp.log(gaussian.std) - _LOG_SQRT_TAU
@@ -368,9 +369,9 @@ def exploration_std(
     r"""
     Standard deviation of the entries of gSDE's noise matrix.
 
-    :param log_std: learned; with one column, it holds for all actions
+    :param log_std: learned; a single column holds for all actions
     :param use_expln: :math:`e^x` for :math:`x \leq 0` and :math:`\log(1 + x + 10^{-6}) + 1` above,
-        which grows slower than the exponential
+        which grows more slowly than the exponential
 
     Source: Rueckstiess et al., *State-dependent exploration for policy gradient methods*, 2008.
     """
@@ -384,8 +385,8 @@ def marginal_std(
     latent: Float[Array, "*batch latent"], std: Float[Array, "latent act"]
 ) -> Float[Array, "*batch act"]:
     r"""
-    :math:`\sqrt{\sum_i z_i^2 \sigma_{ij}^2 + 10^{-6}}`: how far actions scatter over
-    noise matrices.
+    :math:`\sqrt{\sum_i z_i^2 \sigma_{ij}^2 + 10^{-6}}`: standard deviation of actions over noise
+    matrices.
 
     Source: Raffin, Kober and Stulp, *Smooth Exploration for Robotic Reinforcement Learning*, CoRL
     2021, equation 6.
@@ -394,6 +395,6 @@ def marginal_std(
 
 
 def _tanh_slope(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    r""":math:`1 - \tanh^2 x`, whose digits cancel where :math:`\tanh` is near 1, without that."""
+    r""":return: :math:`1 - \tanh^2 x`, without cancellation where :math:`\tanh` is near 1"""
     t = jnp.exp(-2.0 * jnp.abs(x))
     return 4.0 * t / (1.0 + t) ** 2

@@ -1,10 +1,9 @@
 """
 The update of the SAC family, pure and compiled once.
 
-:func:`update` makes several updates; :func:`update_once` is one: regress the critics on soft
-targets, now and then improve the actor and adapt the entropy coefficient, now and then
-Polyak-average the target critics. What differs between two algorithms of the family is an
-:class:`UpdateConfig`.
+:func:`update` makes several updates. :func:`update_once` regresses the critics on soft targets, in
+intervals improves the actor and adapts the entropy coefficient, and in intervals Polyak-averages
+the target critics. Algorithms of the family differ in their :class:`UpdateConfig`.
 """
 
 import dataclasses
@@ -33,10 +32,10 @@ class SACState(NamedTuple):
     """
     Everything that an update changes.
 
-    :param target: weights of the target critics; empty where there are none
+    :param target: weights of the target critics; empty if there are none
     :param log_ent_coef: logarithm of the entropy coefficient, shape ``()``
     :param obs_stats: running statistics of the observations
-    :param extra: state of what only one algorithm has
+    :param extra: state of :class:`Extra`; empty without one
     """
 
     actor: TrainState
@@ -50,7 +49,7 @@ class SACState(NamedTuple):
 
 
 class Hyperparams(NamedTuple):
-    """What may change from call to call without compiling again."""
+    """What may change between two calls without recompiling."""
 
     learning_rate: float
     qf_learning_rate: float
@@ -59,7 +58,7 @@ class Hyperparams(NamedTuple):
 
 
 class UpdateMetrics(NamedTuple):
-    """Of the last update; the actor's are those of the last update that included the actor."""
+    """Of the last update; the actor's and the entropy coefficient's of their own last update."""
 
     critic_loss: Loss
     actor_loss: Loss
@@ -73,25 +72,26 @@ _ADAM = Optimizer(optax.adam)
 @dataclasses.dataclass(frozen=True)
 class UpdateConfig:
     """
-    What the update of one algorithm is made of. Static: equal configs share compiled programs.
+    Static configuration of an algorithm's update; equal configs share compiled programs.
 
-    :param actor: observation to ``Gaussian``
-    :param critic: observation and action to values; an ensemble shares this one's structure
-    :param n_critics: members of the ensemble
-    :param target_values: next values of all critics to those in the targets
-    :param critic_loss: of all critics' values against the targets
-    :param actor_objective: values of all critics to what the actor maximises, shape ``(batch,)``
+    :param actor: maps an observation to a ``Gaussian``
+    :param critic: maps observation and action to values; the structure of all critics
+    :param n_critics: number of critics
+    :param target_values: maps the next values of all critics to the values in the targets
+    :param critic_loss: loss of the values of all critics for given targets
+    :param actor_objective: maps the values of all critics to what the actor maximises, shape
+        ``(batch,)``
     :param optimizer: of the actor
     :param qf_optimizer: of the critics
     :param ent_coef_optimizer: of the logarithm of the entropy coefficient
-    :param policy_delay: updates of the critics for each of the actor
-    :param target_update_interval: updates of the critics for each of the target critics
+    :param policy_delay: updates of the critics per update of the actor
+    :param target_update_interval: updates of the critics per update of the target critics
     :param learns_ent_coef: whether the entropy coefficient is adapted to the target entropy
     :param linear_ent_coef: whether its loss is linear in the coefficient, not in its logarithm
     :param joint_pass: whether current and next values come from one forward pass of the critics,
         without target critics (CrossQ)
-    :param normalize_observations: whether by running statistics (SimBa)
-    :param extra: what else is updated after the actor; None: nothing
+    :param normalize_observations: whether to normalise them by running statistics (SimBa)
+    :param extra: what is updated in addition, after the actor; None: nothing
     """
 
     actor: nn.Module
@@ -113,11 +113,10 @@ class UpdateConfig:
 
 
 class Extra(Protocol):
-    """Something more that learns (BRO's optimistic actor)."""
+    """An additional part that learns, such as BRO's optimistic actor."""
 
     def init(self, actor: Weights, obs: Array, key: PRNGKeyArray) -> Any:
-        """:return: its state, for fresh networks"""
-        ...
+        """:return: its initial state"""
 
     def update(
         self, config: UpdateConfig, state: SACState, batch: Batch, hyper: Hyperparams, key: Any
@@ -136,7 +135,7 @@ class Extra(Protocol):
 def init_state(
     config: UpdateConfig, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray
 ) -> SACState:
-    """:return: fresh networks and optimisers"""
+    """:return: newly initialised networks and optimisers"""
     key, actor_key, critic_key, extra_key = jax.random.split(key, 4)
     obs, action = jnp.zeros((1, n_obs)), jnp.zeros((1, n_act))
     actor = config.actor.init(actor_key, obs)
@@ -167,10 +166,10 @@ def update(
     metrics: UpdateMetrics,
 ) -> tuple[SACState, UpdateMetrics]:
     """
-    :param batches: with a leading axis of at least ``n`` batches; the rest is not looked at, so
-        that different ``n`` share a compiled program
-    :param n: how many updates, at least 1
-    :param metrics: of the updates before
+    :param batches: with a leading axis of at least ``n`` batches; the rest is ignored, so that
+        different ``n`` share a compiled program
+    :param n: number of updates, at least 1
+    :param metrics: of the previous updates
     """
 
     def one(i: Array, carry: tuple[SACState, UpdateMetrics]) -> tuple[SACState, UpdateMetrics]:
@@ -178,7 +177,7 @@ def update(
         return update_once(config, state, jax.tree.map(lambda x: x[i], batches), hyper, metrics)
 
     before = state, metrics
-    if len(batches.reward) == 1:  # without a loop, whose carry would be copied
+    if len(batches.reward) == 1:  # a loop would copy its carry
         return one(jnp.zeros((), jnp.int32), before)
     return jax.lax.fori_loop(0, n, one, before)
 
@@ -190,7 +189,7 @@ def update_once(
     hyper: Hyperparams,
     metrics: UpdateMetrics,
 ) -> tuple[SACState, UpdateMetrics]:
-    """The critics on one batch; every ``policy_delay`` updates the actor on the same one."""
+    """Update the critics on one batch, every ``policy_delay`` updates the actor on the same one."""
     if config.normalize_observations:
         batch = batch._replace(
             obs=normalize(state.obs_stats, batch.obs),
@@ -255,16 +254,16 @@ def update_actor(
     key: PRNGKeyArray,
 ) -> tuple[tuple[TrainState, TrainState, Any], UpdateMetrics]:
     r"""
-    Maximise :math:`Q(s, a) - \alpha \log \pi(a | s)` over the actor, and move the entropy towards
-    its target by the entropy coefficient.
+    Maximise :math:`Q(s, a) - \alpha \log \pi(a | s)` over the actor, and adapt the entropy
+    coefficient :math:`\alpha` to the target entropy.
 
     The loss of the entropy coefficient is :math:`\log\alpha\,(H - \bar{H})`, as in SB3, SBX and
     the authors' code of DroQ and TQC; with ``linear_ent_coef``, it is
     :math:`\alpha\,(H - \bar{H})`, as in equation 18 of Haarnoja et al. Adam cancels the factor
-    between their slopes only where it does not change. Where :math:`\alpha` steadily falls, the
-    latter falls at :math:`\sqrt{1 + k^2} - k` of the speed, with :math:`k` the learning rate in
-    units of 1e-3, as Adam remembers squares for 1000 updates: 0.9, 0.74 and 0.41 at 1e-4, 3e-4 and
-    1e-3.
+    :math:`\alpha` between their slopes only while it is constant. Where :math:`\alpha` falls
+    steadily, the latter falls at :math:`\sqrt{1 + k^2} - k` of the speed, with :math:`k` the
+    learning rate in units of 1e-3, since Adam averages squares over 1000 updates: 0.9, 0.74 and
+    0.41 at 1e-4, 3e-4 and 1e-3.
     """
     act_key, q_key, extra_key = jax.random.split(key, 3)
     ent_coef = jnp.exp(state.log_ent_coef.weights["params"])
@@ -311,12 +310,12 @@ def soft_update(
 
 
 def min_values(values: Values) -> Targets:
-    """Of the critics, value by value: clipped double Q-learning (Fujimoto et al. 2018)."""
+    """Minimum over critics, value by value: clipped double Q-learning (Fujimoto et al. 2018)."""
     return jnp.min(values, 0)
 
 
 def mean_values(values: Values) -> Targets:
-    """Of the critics, value by value (BRO)."""
+    """Mean over critics, value by value (BRO)."""
     return jnp.mean(values, 0)
 
 
@@ -366,16 +365,16 @@ def q_values(
 
     keys = jax.random.split(key, config.n_critics)
     if config.n_critics > 1:
-        # Of inputs without an axis of the critics, XLA computes products that it then transposes.
+        # For inputs without an axis of critics, XLA would compute products and transpose them.
         each = lambda x: jnp.broadcast_to(x, (config.n_critics, *x.shape))  # noqa: E731
         return jax.vmap(one)(weights, keys, each(obs), each(action))
-    # One critic, mapped: XLA computes gradients of its kernels transposed, and Adam walks across.
+    # For one critic under vmap, XLA would transpose the gradients of kernels, which slows Adam.
     values, weights = one(jax.tree.map(lambda x: x[0], weights), keys[0], obs, action)
     return values[None], jax.tree.map(lambda x: x[None], weights)
 
 
 def sample(gaussian: Gaussian, key: PRNGKeyArray) -> tuple[Array, Array]:
-    """:return: actions drawn from it, and their log-density"""
+    """:return: actions sampled from the policy, and their log-density"""
     before = gaussian.mean + gaussian.std * jax.random.normal(key, gaussian.mean.shape)
     return jnp.tanh(before), log_probability(gaussian, before)
 
@@ -385,7 +384,7 @@ def explore(
 ) -> Array:
     """
     :param weights: of the actor
-    :param extra: state of what only one algorithm has
+    :param extra: state of ``config.extra``
     :param obs: as the networks see them
     :param noise: maps a Gaussian to deviations from its mean, before tanh
     :return: exploratory actions
@@ -397,5 +396,5 @@ def explore(
 
 
 def log_of(ent_coef: Array | float) -> Array:
-    """:return: its logarithm; of 0, that of the least positive number, with no infinity in it"""
+    """:return: its logarithm, finite also for 0: that of the least positive normal number"""
     return jnp.log(jnp.maximum(jnp.asarray(ent_coef, jnp.float32), jnp.finfo(jnp.float32).tiny))

@@ -22,13 +22,14 @@ _KERNELS = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
 
 
 def average_l1_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
-    """:return: of mean absolute value 1 (section 4.1 of the paper)"""
+    """:return: ``x``, scaled to a mean absolute value of 1 (section 4.1 of the paper)"""
     return x / jnp.maximum(jnp.mean(jnp.abs(x), -1, keepdims=True), _EPSILON)
 
 
 class Encoder(nn.Module):
     """
-    State to embedding :math:`z^s`, and embedding and action to the embedding of the next state.
+    Map the state to its embedding :math:`z^s`, and :math:`z^s` and the action to :math:`z^{sa}`, a
+    prediction of the next state's embedding.
 
     :param n: size of the embeddings
     :param net_arch: hidden widths
@@ -40,7 +41,7 @@ class Encoder(nn.Module):
     activation_fn: Activation
 
     def setup(self) -> None:
-        # Flax draws weights by these names, too: others would give a seed other networks.
+        # Flax derives initial weights from these names: a seed's networks depend on them.
         self.of_state = _Dense((*self.net_arch, self.n), self.activation_fn)
         self.of_both = _Dense((*self.net_arch, self.n), self.activation_fn)
 
@@ -51,10 +52,10 @@ class Encoder(nn.Module):
 
 class Actor(nn.Module):
     """
-    Observation and its embedding to controls.
+    Map an observation and its embedding to an action.
 
-    :param n_act: number of controls
-    :param net_arch: hidden widths; the observation passes the first, then its embedding joins
+    :param n_act: number of actions
+    :param net_arch: hidden widths; the embedding is concatenated after the first layer
     :param activation_fn: between the layers
     """
 
@@ -73,9 +74,9 @@ class Actor(nn.Module):
 
 class Critic(nn.Module):
     """
-    Observation, action and both embeddings to a value.
+    Map observation, action and both embeddings to a value.
 
-    :param net_arch: hidden widths; observation and action pass the first, then embeddings join
+    :param net_arch: hidden widths; the embeddings are concatenated after the first layer
     :param activation_fn: between the layers
     """
 
@@ -96,7 +97,7 @@ class Critic(nn.Module):
 
 
 def _first(x: Array, net_arch: Sequence[int]) -> Array:
-    """A layer of the first width; without hidden layers, what comes in."""
+    """A layer of the first width; the identity without hidden layers."""
     return _linear(x, net_arch[0]) if net_arch else x
 
 
@@ -115,8 +116,8 @@ class _Dense(nn.Module):
 
 def _linear(x: Array, size: int) -> Array:
     r"""
-    A layer that starts as torch's ``Linear``: weights and biases uniform within
-    :math:`\pm 1 / \sqrt{n}` of :math:`n` inputs.
+    A layer with the initial values of torch's ``Linear``: weights and biases uniform within
+    :math:`\pm 1 / \sqrt{n}` for :math:`n` inputs.
     """
     limit = 1.0 / math.sqrt(x.shape[-1])
 

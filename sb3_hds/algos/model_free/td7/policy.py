@@ -1,4 +1,4 @@
-"""The policy of TD7, as SB3 sees it."""
+"""The policy of TD7."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -33,15 +33,15 @@ class TD7PolicyConfig(PolicyConfig):
 
     :param observation_space: a Box, or choices, which become one-hot
     :param action_space: a bounded Box of any shape
-    :param net_arch: hidden widths of all, or ``{"pi": [...], "qf": [...]}``
+    :param net_arch: hidden widths of all networks, or ``{"pi": [...], "qf": [...]}``
     :param embedding_size: of states, and of pairs of state and action
     :param activation_fn: of the actor: name, JAX function or torch module class
     :param qf_activation_fn: of encoder and critics
-    :param n_critics: members of the ensemble
-    :param optimizer_class: name or function of optax, with its defaults, or torch class, with those
-        of torch
+    :param n_critics: number of critics
+    :param optimizer_class: name or function of optax, with its defaults, or torch class, with
+        torch's defaults
     :param optimizer_kwargs: besides the learning rate
-    :param use_sde: accepted for SB3's sake; the policy is deterministic
+    :param use_sde: passed by SB3; the policy is deterministic
     """
 
     net_arch: Sequence[int] | Mapping[str, Sequence[int]] = (256, 256)
@@ -63,8 +63,8 @@ class TD7PolicyConfig(PolicyConfig):
 
 class TD7Policy(LearningPolicy):
     """
-    ``"MlpPolicy"`` of TD7: encoder, actor and two critics. Where nothing is explored, the policy
-    of the last checkpoint acts, once one was kept.
+    ``"MlpPolicy"`` of TD7: encoder, actor and two critics. Deterministic actions are those of the
+    checkpoint, if there is one.
     """
 
     held = ("copies", "checkpoint")
@@ -87,12 +87,12 @@ class TD7Policy(LearningPolicy):
         }
 
     def build_plain(self) -> None:
-        """That of the paper."""
+        """Initialise networks for the paper's update."""
         self.build(UpdateConfig(**self.parts), 0, jax.devices()[0])
 
     def build(self, config: UpdateConfig, seed: int, device: Any) -> None:
         """
-        Draw fresh networks.
+        Initialise the networks.
 
         :param config: of the algorithm
         """
@@ -102,22 +102,22 @@ class TD7Policy(LearningPolicy):
 
     @property
     def has_checkpoint(self) -> bool:
-        """Whether a checkpoint was kept, which then acts where nothing is explored."""
+        """Whether there is a checkpoint, which then provides deterministic actions."""
         return float(self.agent_state.checkpoint.kept) > 0.0
 
     def keep_checkpoint(self) -> None:
-        """The policy as it is acts from now on where nothing is explored."""
+        """Copy the current policy into the checkpoint."""
         state = self.agent_state
         checkpoint = Checkpoint(state.copies.encoder, state.actor.weights, jnp.ones(()))
         self.agent_state = state._replace(checkpoint=checkpoint)
 
     def drop_checkpoint(self) -> None:
-        """The policy as it is at the time acts, explored or not."""
+        """Let the current policy provide deterministic actions again."""
         checkpoint = self.agent_state.checkpoint._replace(kept=jnp.zeros(()))
         self.agent_state = self.agent_state._replace(checkpoint=checkpoint)
 
     def policy_function(self) -> PolicyFunction:
-        """:return: what the policy computes where nothing is explored, to be exported"""
+        """:return: the deterministic policy, to be exported"""
         act = partial(_act, self.update_config, *self._acting(deterministic=True))
         return PolicyFunction.without_memory(act, squashed=True)
 
@@ -126,7 +126,7 @@ class TD7Policy(LearningPolicy):
         return np.asarray(_act(self.update_config, *weights, self.flatten(observation)))
 
     def _acting(self, deterministic: bool) -> tuple[Any, Any]:
-        """Weights of the encoder and of the actor."""
+        """:return: weights of the encoder and of the actor that act"""
         state = self.agent_state
         if deterministic and self.has_checkpoint:
             return state.checkpoint.encoder, state.checkpoint.actor
