@@ -1,9 +1,9 @@
 """
-The shell of every algorithm that plans in a twin.
+What the algorithms that plan in a twin share.
 
-SB3 collects real steps and calls ``train``; a call of ``train`` is one planning epoch in the twin
-(the pure functions in ``epoch.py``). A timestep is a step of the environment that the user passed
-in, nothing else; simulated steps are counted apart.
+SB3 collects real steps and calls ``train``, which is one planning epoch in the twin (the pure
+functions in ``epoch.py``). Timesteps are steps of the user's environment only; simulated steps have
+their own counter.
 """
 
 import dataclasses
@@ -56,8 +56,7 @@ from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.envs.mirror import check_mirrors, twin_of
 from sb3_hds.errors import DivergedError
 
-# Decay of what counts as recent in the pretraining, per epoch, and the fewest epochs before it may
-# end early.
+# Decay per epoch of the running means that end the pretraining early, and the fewest epochs before.
 _RECENT = 0.9
 _FEWEST_EPOCHS = 20
 # Factor on the temperature of the annealed acceptance after each epoch: below 1 % after fifty.
@@ -66,7 +65,7 @@ _TEMPERATURE_DECAY = 0.9
 
 class TwinAlgorithm(TensorAlgorithm):
     """
-    Abstract: what PODS and HDS share.
+    Abstract: base of PODS and HDS.
 
     ``learn`` runs the planning epochs of the pretraining (``pretraining.py``), then SB3 alternates
     between real steps and :meth:`train`. Both call :meth:`run_epoch`: ``epoch`` (``epoch.py``)
@@ -79,7 +78,7 @@ class TwinAlgorithm(TensorAlgorithm):
     config_class = TwinConfig
     policy: TwinPolicy
     twin: Twin | None
-    #: the twin contains the layers, so its inputs are the actions before them
+    #: the twin contains the wrappers, so its inputs are the actions before them
     stores_executed: ClassVar[bool] = False
     check_observations = staticmethod(check_twin_observes)
 
@@ -87,21 +86,21 @@ class TwinAlgorithm(TensorAlgorithm):
         config = dataclasses.replace(config, twin=twin_given(config.twin))
         super().construct(config, sde_support=False, **more)
         self.twin_spec: dict[str, Any] | None = None
-        # Running means over epochs of the pretraining, which ends where plans gain nothing more.
+        # Running means over epochs of the pretraining, which ends when plans stop gaining.
         self.recent_gain, self.recent_return = 0.0, 0.0
         self.n_pretrained = 0
-        # A step that callbacks have seen and the replay buffer does not have yet.
+        # A step that was passed to callbacks and not yet added to the replay buffer.
         self.unstored_step: dict[str, Any] | None = None
         self.real_timesteps, self.twin_timesteps = 0, 0
         self.learned_force = Tensors(self)
         self._n_updates = 0
-        # Of this call of ``learn``.
+        # In the current call of ``learn``.
         self._epochs_planned, self._epochs_done = 0, 0
         self._workspace: Workspace | None = None
-        # What programs are compiled for, and the comparison of policies while it compiles.
+        # Config of the compiled programs, and the comparison of policies while it compiles.
         self._compiled: EpochConfig | None = None
         self._comparison: Callable[[], Any] | None = None
-        # Whether a callback ended the training, and what is called while programs compile.
+        # Whether a callback ended the training, and a function to call while programs compile.
         self.stopped = False
         self.poll: Callable[[], None] = nothing
 
@@ -112,7 +111,7 @@ class TwinAlgorithm(TensorAlgorithm):
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         if self.stopped:
-            # By a callback, before the first step.
+            # A callback ended the training before the first step.
             return RolloutReturn(0, 0, continue_training=False)
         return super().collect_rollouts(*args, **kwargs)
 
@@ -131,12 +130,12 @@ class TwinAlgorithm(TensorAlgorithm):
 
     def run_epoch(self, gradient_steps: int) -> EpochMetrics:
         """
-        Improve plans in the twin and regress the policy on them, once.
+        One planning epoch: improve plans in the twin and regress the policy on them.
 
         :param gradient_steps: regression steps
-        :return: what happened, on the device
+        :return: metrics, on the device
         :raises NoTwinError: if the model was loaded without environment and without twin
-        :raises DivergedError: if the regression diverged; the model keeps its last good state
+        :raises DivergedError: if the regression diverged; the model keeps its last finite state
         """
         state, program = self._epoch_state(), self._program
         every = self.config.refinements.compare_every
@@ -145,7 +144,7 @@ class TwinAlgorithm(TensorAlgorithm):
         if program != self._compiled:
             meanwhile(programs(program, state, hyper), self.poll)
             self._compiled, self._comparison = program, None
-        # The first comparison is some epochs away: its program is compiled beside them.
+        # Compile the comparison in another thread during the epochs before it is due.
         ahead = max(1, self._epochs_planned - self._epochs_done)
         compares = every > 0 and (self.comparison_due or n_epochs % every + ahead >= every)
         if compares and self._comparison is None:
@@ -175,7 +174,7 @@ class TwinAlgorithm(TensorAlgorithm):
         return metrics
 
     def hyperparams(self, twin: Twin, gradient_steps: int) -> Hyperparams:
-        """:return: what the next epoch works with, without compiling again"""
+        """:return: the hyperparameters of the next epoch, which may change without recompiling"""
         config, n_epochs = self.config, int(self.policy.progress.n_epochs)
         how = config.refinements
         return Hyperparams(
@@ -194,9 +193,9 @@ class TwinAlgorithm(TensorAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
-        :param env: has the spaces of the one before, as many copies, and a twin
-        :param force_reset: False goes on from where the environment is
-        :raises NoTwinError: if it has no twin; the model then keeps the environment that it had
+        :param env: an environment with a twin, the same spaces and the same number of copies
+        :param force_reset: False continues from the environment's current state
+        :raises NoTwinError: if it has no twin; the model then keeps its environment
         """
         before = self.env, self.n_envs, self._vec_normalize_env, self._last_obs
         super().set_env(env, force_reset)
@@ -226,7 +225,7 @@ class TwinAlgorithm(TensorAlgorithm):
         ]
 
     def _setup_twin(self) -> None:
-        """The twin that was passed, or saved because it had been, or the environment's own."""
+        """Set the twin: the one that was passed, or had been when saved, or the environment's."""
         given: Any = self.twin  # a name, where one was passed to `load`
         if given is not None and not isinstance(given, Twin):
             self.twin = twin_given(given)
@@ -253,12 +252,12 @@ class TwinAlgorithm(TensorAlgorithm):
         self.twin = twin
 
     def _prepared(self, twin: Twin) -> Twin:
-        """:return: what to plan in, given the twin of the environment or the one that was passed"""
+        """:return: the twin to plan in, given the environment's twin or the one that was passed"""
         return twin
 
     @property
     def comparison_due(self) -> bool:
-        """Whether policies are compared after this epoch, whatever ``compare_every`` says."""
+        """Whether policies are compared after this epoch regardless of ``compare_every``."""
         return False
 
     def varied(self, twin: Twin) -> Params:
@@ -281,14 +280,14 @@ class TwinAlgorithm(TensorAlgorithm):
 
     @property
     def _program(self) -> EpochConfig:
-        """What an epoch is compiled for."""
+        """Static configuration of an epoch."""
         return epoch_config(self.config, self.policy, required(self.twin, self.twin_spec))
 
     def _view(self, twin: Twin) -> Any:
         return view_of(self.get_vec_normalize_env(), len(twin.channels))
 
     def _epoch_state(self) -> EpochState:
-        """What an epoch changes. Before the first one, the scales of the task are found."""
+        """The state that an epoch changes; before the first one, find the scales of the task."""
         program, policy = self._program, self.policy
         workspace = self._workspace
         if workspace is None:
@@ -322,7 +321,7 @@ class TwinAlgorithm(TensorAlgorithm):
 
     @property
     def _steps_per_epoch(self) -> int:
-        """Real steps between two epochs; where ``train_freq`` counts episodes, the most."""
+        """Real steps between two epochs; the most there can be if ``train_freq`` is in episodes."""
         assert isinstance(self.train_freq, TrainFreq)
         if self.train_freq.unit.value == "step":
             return self.train_freq.frequency * self.n_envs
@@ -330,7 +329,7 @@ class TwinAlgorithm(TensorAlgorithm):
 
     @property
     def pretraining_due(self) -> int:
-        """Planning epochs that are left to do before the next real step."""
+        """Number of remaining planning epochs before the next real step."""
         config = self.config
         enough = config.refinements.least_gain * self.recent_return
         if self.n_pretrained >= _FEWEST_EPOCHS and self.recent_gain < enough:
@@ -339,8 +338,8 @@ class TwinAlgorithm(TensorAlgorithm):
 
     def pretrain_epoch(self) -> None:
         """
-        One planning epoch before the first real step, like any other. Where plans gain nothing
-        more, it is the last one, and schedules jump over those that are spared.
+        One planning epoch before the first real step. If plans stop gaining, it is the last one,
+        and schedules skip the epochs that are left out.
         """
         planned = self.pretraining_due
         steps = self.gradient_steps if self.gradient_steps >= 0 else self._steps_per_epoch

@@ -1,8 +1,8 @@
 """
-One planning epoch as a pure function: roll the policy out in the twin, improve the plans, keep what
-is better, regress the policy on it, move on.
+One planning epoch as a pure function: roll the policy out in the twin, improve the plans, keep the
+better ones, regress the policy on them, advance the start states.
 
-The stateful shell around it is ``algorithm.py``. Nothing here knows an environment's name.
+``algorithm.py`` holds the state. Nothing here is specific to an environment.
 """
 
 from collections.abc import Callable
@@ -45,16 +45,16 @@ from sb3_hds.planning import (
 )
 from sb3_hds.planning.problem import Control
 
-# By this much, in units of the objective, the plan that began as the policy's own is preferred.
+# Advantage of plans that start from the policy's own over random ones, in units of the objective.
 _TIE = 1e-3
 
 
 class Outcome(NamedTuple):
     """
-    What came of planning. Returns are discounted planning rewards, in the reward's own unit.
+    Metrics of planning. Returns are discounted planning rewards, in the reward's own unit.
 
     :param before: mean return of the policy's own plans
-    :param after: mean return of the plans that were kept
+    :param after: mean return of the kept plans
     :param worsened: number of kept plans that are worse than the policy's own
     :param dropped: number of samples that were not finite
     """
@@ -67,9 +67,9 @@ class Outcome(NamedTuple):
 
 class EpochMetrics(NamedTuple):
     """
-    What an epoch logs.
+    Metrics of an epoch.
 
-    :param plans: what came of planning
+    :param plans: metrics of planning
     :param policy_loss: mean regression loss of the policy
     :param value_loss: mean regression loss of the value
     :param gradient_norm: mean norm of the policy's gradient before it is clipped
@@ -85,10 +85,10 @@ class Choice(NamedTuple):
     """
     The plans of one epoch; leaves of shape ``(n_rollouts, ...)``.
 
-    :param own: what the policy does
-    :param kept: what is learned from
-    :param tails: value of the last state of ``kept``
-    :param sensitivity: cost of an error of each control of ``kept``
+    :param own: rollouts of the policy
+    :param kept: plans to learn from
+    :param tails: value of the last state of each plan in ``kept``
+    :param sensitivity: cost of an error in each control of ``kept``
     """
 
     own: Plan
@@ -101,9 +101,9 @@ def epoch(
     config: EpochConfig, state: EpochState, hyper: Hyperparams
 ) -> tuple[EpochState, EpochMetrics]:
     """
-    Plan from every start state, keep what is better than the policy, regress on it, move on.
+    Plan from every start state, keep plans that are better than the policy, regress on them.
 
-    :return: the state after the epoch, and what happened
+    :return: the state after the epoch, and its metrics
     """
     state, outcome = plan_ahead(config, state, hyper)
     state, losses = learn_from_plans(config, state, hyper)
@@ -114,8 +114,8 @@ def epoch_log(
     metrics: EpochMetrics, hyper: Hyperparams, returns: Float[np.ndarray, " 2"] | None
 ) -> dict[str, float]:
     """
-    :param returns: of the average policy and of the one that acted so far, if they were compared
-    :return: what an epoch logs, by key
+    :param returns: of the averaged policy and of the one that acted so far, if they were compared
+    :return: logged values by key
     """
     compared = {}
     if returns is not None:
@@ -139,7 +139,7 @@ def epoch_log(
 def plan_ahead(
     config: EpochConfig, state: EpochState, hyper: Hyperparams
 ) -> tuple[EpochState, Outcome]:
-    """The first half of an epoch: everything that happens in the twin."""
+    """The first half of an epoch: rollouts and planning in the twin."""
     key = jax.random.wrap_key_data(state.progress.key, impl=GENERATOR)
     key, k_noise, k_plan, k_move = jax.random.split(key, 4)
     problem = problem_of(config, state, hyper)
@@ -161,15 +161,15 @@ def plan_ahead(
 
 
 def control_of(config: EpochConfig, state: EpochState, hyper: Hyperparams, obs: Obs) -> Control:
-    """:return: what the policy in training does for an observation of the twin"""
+    """:return: control of the policy in training for an observation of the twin"""
     seen = state.networks.inside(hyper.view(obs))
     return output(config.actor, state.networks.actor, seen)
 
 
 def twin_steps_per_epoch(config: EpochConfig) -> int:
     """
-    :return: simulated steps of one epoch, line searches included; a Jacobian counts one step for
-        each of its columns besides the step itself, as many as finite differences would take
+    :return: simulated steps of one epoch, line searches included; a Jacobian counts as many steps
+        as finite differences would take, one per column and the step itself
     """
     s = config
     columns = 2 * len(s.twin.joints) + len(s.twin.actuators)
@@ -188,7 +188,7 @@ def _act(
     starts: State,
     key: PRNGKeyArray,
 ) -> tuple[Plan, Plan]:
-    """What the policy does from each start state, and what it does with exploration noise."""
+    """:return: rollouts of the policy from each start state, without and with exploration noise"""
     policy = partial(control_of, config, state, hyper)
 
     def act(start: State, offset: Control, varied: Params) -> Plan:
@@ -214,14 +214,14 @@ def _plan(
     own: Plan,
     key: PRNGKeyArray,
 ) -> Choice:
-    """For each of the policy's own plans, the plan that is kept."""
+    """Improve the policy's own and random plans, and choose the plan to keep for each start."""
     k_random, k_improve, k_keep = jax.random.split(key, 3)
     n, fresh = config.n_rollouts, _random_slots(config)
     policy = partial(control_of, config, state, hyper)
     first, tried = own, _pick(hyper.varied, fresh)
     varied = hyper.varied
     if fresh.size:
-        # Without the barrier, XLA gathers again in every step of the loops.
+        # Without the barrier, XLA repeats the gather in every step of the loops.
         starts = jax.tree.map(lambda leaf: leaf[fresh, 0], own.states)
         starts = jax.lax.optimization_barrier(starts)
 
@@ -255,7 +255,7 @@ def _plan(
 
 
 def _random_slots(config: EpochConfig) -> np.ndarray:
-    """:return: the rollouts for which random plans are tried too"""
+    """:return: indices of the rollouts that also get random plans"""
     count = round(config.n_rollouts * config.random_share) if config.n_candidates else 0
     return np.linspace(0, config.n_rollouts, count, endpoint=False).astype(int)
 
@@ -269,7 +269,7 @@ def _improve(
     varied: Params,
     key: PRNGKeyArray,
 ) -> tuple[Plan, Float[Array, "plans horizon"]]:
-    """:return: the improved plans, and what an error of each of their controls costs"""
+    """:return: the improved plans, and the cost of an error in each of their controls"""
     discounts = config.discount ** jnp.arange(config.horizon)
     temperature = hyper.temperature * state.progress.gain
 
@@ -293,7 +293,7 @@ def _improve(
 
 
 def _tail(config: EpochConfig, problem: Problem, policy, end: State) -> jax.Array:
-    """Value of a plan's end by what the policy makes of it: errors of V are not exploited."""
+    """Value of a plan's end from a rollout of the policy, which does not exploit errors of V."""
     if not config.lookahead:
         return problem.value_at_end(end)
     return follow(problem, end, policy, config.lookahead).value
@@ -302,7 +302,7 @@ def _tail(config: EpochConfig, problem: Problem, policy, end: State) -> jax.Arra
 def _move_on(
     config: EpochConfig, state: EpochState, hyper: Hyperparams, wandering: Plan, key: PRNGKeyArray
 ) -> tuple[State, Float[Array, " rollouts"]]:
-    """The next start states: where the policy went with exploration noise, or a reset."""
+    """:return: the next start states, from the rollouts with exploration noise or resets; ages"""
     n = config.n_rollouts
     k_reset, k_draw = jax.random.split(key)
     fresh = resets(config.twin, hyper.params, k_draw, n)
@@ -319,8 +319,8 @@ def _move_on(
 
 def _reset_rates(share: float, n: int) -> Float[Array, " rollouts"]:
     """
-    How often each rollout is reset: ``share`` on average, distributed from hardly ever to
-    nearly always, so that there are start states soon after a reset and long after one.
+    Reset probability of each rollout: ``share`` on average, from nearly 0 to nearly 1, so that
+    start states are both shortly and long after a reset.
     """
     position = (jnp.arange(n) + 0.5) / n
     return position ** (1.0 / share - 1.0)
@@ -360,6 +360,6 @@ def _where(condition, new, old):
 
 
 def programs(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> list[Callable[[], Any]]:
-    """:return: the programs of an epoch; running them once, in parallel, compiles them"""
+    """:return: the programs of an epoch, to be compiled in parallel by running each once"""
     used = [plan_ahead, *regressions(config)]
     return [partial(program, config, state, hyper) for program in used]

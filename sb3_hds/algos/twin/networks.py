@@ -10,27 +10,25 @@ from jaxtyping import Array, Float
 
 from sb3_hds.algos.nets.options import Activation
 
-# Width around zero where the value is linear rather than a square root, in units of the scaled
-# reward.
+# Scale of the value below which its root is linear, in units of the scaled reward.
 _NEAR_ZERO = 0.3
-# Squares in the value.
+# Number of squares in the value.
 _N_SQUARES = 8
-# Uniform rather than normal: half a second less to compile. Small in a last layer, so that a
-# network starts near zero.
+# Uniform rather than normal saves half a second of compilation. Small in last layers, so that
+# networks start near zero.
 _HIDDEN = nn.initializers.variance_scaling(1.0, "fan_in", "uniform")
 _SMALL = nn.initializers.variance_scaling(1e-4, "fan_in", "uniform")
 
 
 class Actor(nn.Module):
     """
-    Observation to control in (-1, 1), with a small last layer, so that it starts near zero.
+    Map an observation to a control in (-1, 1), near zero at first.
 
     :param n_act: number of controls
     :param net_arch: widths of the hidden layers
     :param activation_fn: between the layers
-    :param linear_path: whether a linear map goes from input to output beside the hidden layers:
-        near a balance the best control is linear in the state, and many units agree on a line
-        slowly
+    :param linear_path: whether a linear map from input to output is added: near a balance, the best
+        control is linear in the state, which hidden layers learn slowly
     """
 
     n_act: int
@@ -48,8 +46,8 @@ class Actor(nn.Module):
 
 
 class Value(nn.Module):
-    """
-    Observation to roots :math:`\rho` of the value, see :func:`value_of`.
+    r"""
+    Map an observation to roots :math:`\rho` of the value, see :func:`value_of`.
 
     :param net_arch: widths of the hidden layers
     :param activation_fn: between the layers
@@ -65,15 +63,15 @@ class Value(nn.Module):
 
 
 def output(network: Actor | Value, weights: Mapping[str, Any], obs: jax.Array) -> jax.Array:
-    """:return: what a network puts out for one observation or a batch"""
+    """:return: output of a network for one observation or a batch"""
     return cast(jax.Array, network.apply(weights, obs))
 
 
 def with_input_scales(weights: Mapping[str, Any], old: Any, new: Any) -> Mapping[str, Any]:
     """
     :param weights: of an ``Actor`` or ``Value`` whose input is ``(obs - old.mean) / old.scale``
-    :param new: mean and scale from now on, each of shape ``(n_obs,)``
-    :return: weights that compute the same of ``(obs - new.mean) / new.scale``
+    :param new: mean and scale of the new input, each of shape ``(n_obs,)``
+    :return: weights of the same function of the input ``(obs - new.mean) / new.scale``
     """
     layers = dict(weights["params"])
     first = "Dense_0" if "Dense_0" in layers else "last"
@@ -94,24 +92,24 @@ def value_of(roots: Float[Array, "*batch roots"]) -> Float[Array, "*batch"]:
     r"""
     :math:`V = u(\rho_0) - \sum_{i \geq 1} \rho_i^2`, with :func:`unsquash` for :math:`u`.
 
-    Near a goal the value is minus a quadratic form. Squares have one without effort, and its
-    curvature is known from their slopes.
+    Near a goal the value is minus a quadratic form. Squares represent it exactly, and their slopes
+    give its curvature.
     """
     return unsquash(roots[..., 0]) - jnp.sum(roots[..., 1:] ** 2, -1)
 
 
 def squash(value: jax.Array) -> jax.Array:
     r"""
-    The root that the value network learns: :math:`y\,(|y| + 0.3) = V`.
+    The root :math:`y` that the value network learns: :math:`y\,(|y| + 0.3) = V`.
 
-    A network that learns V itself errs by a share of its range, which near the goal is more than
-    all that is left to gain; the root has relative precision there.
+    The error of a network is a share of its range. For V itself, that exceeds the remaining gain
+    near the goal; the root has relative precision there.
     """
     return jnp.sign(value) * (jnp.sqrt(_NEAR_ZERO**2 + 4.0 * jnp.abs(value)) - _NEAR_ZERO) / 2.0
 
 
 def unsquash(root: jax.Array) -> jax.Array:
-    """:return: the value for what the network puts out; the inverse of :func:`squash`"""
+    """:return: the value of a root; the inverse of :func:`squash`"""
     return root * (jnp.abs(root) + _NEAR_ZERO)
 
 

@@ -1,4 +1,4 @@
-"""The deterministic policy of PODS and HDS, as SB3 sees it."""
+"""The deterministic policy of PODS and HDS."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -31,10 +31,10 @@ class TwinPolicyConfig(PolicyConfig):
     :param net_arch: hidden widths of both networks, or ``{"pi": [...], "vf": [...]}``; default
         96, 96 for the policy and 64, 64 for the value
     :param activation_fn: name, JAX function or torch module class
-    :param linear_path: whether a linear map leads from the policy's input to its output beside the
-        hidden layers (the paper: no)
+    :param linear_path: whether a linear map from input to output is added to the hidden layers of
+        the policy (the paper: no)
     :param max_grad_norm: gradients of both networks are clipped to this norm
-    :param use_sde: accepted for SB3's sake; the policy is deterministic
+    :param use_sde: passed by SB3; the policy is deterministic
     """
 
     net_arch: Sequence[int] | dict[str, Sequence[int]] | None = None
@@ -53,7 +53,7 @@ class TwinPolicyConfig(PolicyConfig):
 
 class TwinPolicy(TensorPolicy):
     """
-    A policy network with a value network beside it, both with their own input normalisation.
+    A policy network and a value network, with their own normalisation of inputs.
     """
 
     @takes(TwinPolicyConfig)
@@ -73,9 +73,10 @@ class TwinPolicy(TensorPolicy):
 
     def build(self, key: jax.Array, device: Any) -> None:
         """
-        Draw fresh networks.
+        Initialise the networks.
 
         :param key: of the generator ``unsafe_rbg``
+        :param device: of JAX
         """
         n_obs = spaces.flatdim(self.observation_space)
         networks, progress = fresh_networks(
@@ -113,7 +114,7 @@ class TwinPolicy(TensorPolicy):
         return np.asarray(_act(self.actor_network, self.networks, flat))
 
     def policy_function(self) -> PolicyFunction:
-        """:return: what the policy computes, to be exported"""
+        """:return: the policy, to be exported"""
         inside = self.networks.acting_inside
         return PolicyFunction.without_memory(
             partial(_act, self.actor_network, self.networks),
@@ -132,5 +133,5 @@ def _act(actor: Actor, networks: Networks, obs: Any) -> Any:
 
 
 def all_finite(networks: Networks) -> bool:
-    """:return: whether no weight is infinite or not a number"""
+    """:return: whether all weights are finite"""
     return finite_leaves((networks.actor, networks.average, networks.value, networks.acting))

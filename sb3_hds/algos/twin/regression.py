@@ -1,4 +1,4 @@
-"""Learning from plans: regress policy and value on them, and choose the policy that acts."""
+"""Regression of policy and value on plans, and the choice of the policy that acts."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -27,16 +27,15 @@ from sb3_hds.core import Twin
 from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION
 from sb3_hds.planning import Plan, Problem, follow
 
-# Where the absolute error of the regression turns into a squared one, in units of the control
-# scale.
+# Error below which the absolute loss becomes quadratic, in units of the control scale.
 _SMOOTH_ERROR = 0.1
-# Epochs after which a new one counts one half in the scales that follow the plans.
+# Numerator of the rate at which scales follow the plans: after this many epochs, it is 1/2.
 _FORGETTING = 3.0
-# Below this, an input does not move and its scale is left alone; controls are at least this large.
-_LEAST_SPREAD, _LEAST_EFFORT = 1e-6, 1e-3
-# No sample counts more than this many times the mean.
+# Inputs with a smaller standard deviation keep their scale; smallest control scale.
+_LEAST_STD, _LEAST_CONTROL = 1e-6, 1e-3
+# Largest weight of a sample, in units of the mean weight.
 _LARGEST_WEIGHT = 20.0
-# Simulated steps of a policy in a comparison, and the numbers of episodes between which they make.
+# Simulated steps of each policy in a comparison, and the limits of the number of episodes.
 _STEPS_COMPARED = 64_000
 _FEWEST, _MOST = 32, 256
 
@@ -50,19 +49,18 @@ def samples_of(
     sensitivity: Float[Array, "rollouts horizon"],
 ) -> tuple[Samples, Bool[Array, " rollouts"]]:
     r"""
-    At every state of the *improved* trajectories: the control to copy, the objective from there on
+    Samples at every state of the *improved* trajectories: the control, the objective from there on
 
     .. math:: Y_t = r_t + \gamma Y_{t+1}
 
-    and a weight that grows with what the plan gained over the policy and with what an error costs
-    there.
+    and a weight that grows with the plan's gain over the policy and with the cost of an error.
 
     :param kept: plans, leaves of shape ``(n_rollouts, ...)``
     :param tails: value of each plan's last state
     :param gain: of each plan over the policy's own
-    :param sensitivity: cost of an error of each control
+    :param sensitivity: cost of an error in each control
     :return: samples, leaves of shape ``(horizon * n_rollouts, ...)``, and which plans were finite;
-        the others weigh nothing
+        the others have weight zero
     """
     before = jax.tree.map(lambda leaf: leaf[:, :-1], kept.states)
     obs = jax.vmap(jax.vmap(lambda state: hyper.view(problem.observe(state))))(before)
@@ -88,7 +86,7 @@ def samples_of(
 
 
 def remember(config: EpochConfig, state: EpochState, samples: Samples) -> EpochState:
-    """Write an epoch's samples over the oldest row."""
+    """Replace the oldest row of samples by those of this epoch."""
     work = state.workspace
     row = work.n_filled % config.plan_memory
     write = lambda rows, new: jax.lax.dynamic_update_index_in_dim(rows, new, row, 0)  # noqa: E731
@@ -98,33 +96,30 @@ def remember(config: EpochConfig, state: EpochState, samples: Samples) -> EpochS
 
 def rescale(state: EpochState, samples: Samples) -> EpochState:
     """
-    Let the scales of inputs and controls follow the plans: near a balance both are far smaller than
-    in the random rollouts from which they were first taken. Old epochs are forgotten at a rate of
-    3/n. The networks' first layers change with their inputs, so that what they compute does not.
+    Let the scales of inputs and controls follow the plans, at a rate of 3 / (n + 3) after n epochs:
+    near a balance, both are far smaller than in the first, random rollouts. The networks' first
+    layers change with the scales of their inputs, so that their outputs stay the same.
     """
     nets, progress = state.networks, state.progress
     counted = samples.alive[:, None]
     rate = _FORGETTING / (progress.n_epochs + _FORGETTING) * jnp.any(counted > 0.0)
     total = jnp.maximum(jnp.sum(counted), 1.0)
     mean = jnp.sum(counted * samples.obs, 0) / total
-    spread = jnp.sqrt(jnp.sum(counted * (samples.obs - mean) ** 2, 0) / total)
-    sizes = jnp.log(jnp.abs(samples.control) + _LEAST_EFFORT)
-    effort = jnp.exp(jnp.sum(counted * sizes, 0) / total)
-    follow = lambda old, new: old + rate * (new - old)  # noqa: E731
-    spread = jnp.where(spread > _LEAST_SPREAD, spread, nets.inside.scale)
+    std = jnp.sqrt(jnp.sum(counted * (samples.obs - mean) ** 2, 0) / total)
+    sizes = jnp.log(jnp.abs(samples.control) + _LEAST_CONTROL)
+    control_scale = jnp.exp(jnp.sum(counted * sizes, 0) / total)
+    update = lambda old, new: old + rate * (new - old)  # noqa: E731
+    std = jnp.where(std > _LEAST_STD, std, nets.inside.scale)
     inside = nets.inside._replace(
-        mean=follow(nets.inside.mean, mean), scale=follow(nets.inside.scale, spread)
+        mean=update(nets.inside.mean, mean), scale=update(nets.inside.scale, std)
     )
-    effort = jnp.clip(follow(progress.control_scale, effort), _LEAST_EFFORT, 1.0)
+    control_scale = jnp.clip(update(progress.control_scale, control_scale), _LEAST_CONTROL, 1.0)
     actor, average, value = (
         with_input_scales(weights, nets.inside, inside)
         for weights in (nets.actor, nets.average, nets.value)
     )
     nets = nets._replace(actor=actor, average=average, value=value, inside=inside)
-    return state._replace(
-        networks=nets,
-        progress=progress._replace(control_scale=effort),
-    )
+    return state._replace(networks=nets, progress=progress._replace(control_scale=control_scale))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -132,12 +127,12 @@ def learn_policy(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> 
     r"""
     Regress the policy on the remembered samples: Adam on minibatches.
 
-    The policy learns from the first steps of each plan only: what a plan does towards its end
-    depends on the value found there.
+    The policy learns from the first steps of each plan only: the end of a plan depends on the
+    learned value.
 
-    Its loss is :math:`w\,\sqrt{e^2 + 0.1^2}` with the error :math:`e` in units of the control
-    scale: a squared error averages between turning left and turning right, and blurs the moments
-    of switching. The paper's :math:`w\,e^2/2`, in units of the control, is a setting.
+    The loss is :math:`w\,\sqrt{e^2 + 0.1^2}` with the error :math:`e` in units of the control
+    scale: a squared error averages between turning left and turning right, and blurs switching
+    times. The paper's :math:`w\,e^2/2`, in units of the control, is an option.
 
     :return: the policy's parameters, their moving average and the state of Adam; the mean loss, and
         the mean norm of the gradient before it is clipped; the number of epochs and the random key
@@ -199,7 +194,7 @@ def _descent(
     weights: Mapping[str, Any],
     optimizer: Any,
 ) -> tuple[Mapping[str, Any], Any, Float[Array, " 2"]]:
-    """Of each remembered epoch, the first ``n`` samples are drawn from."""
+    """Adam on batches that are drawn from the first ``n`` samples of each remembered epoch."""
     adam, work = clipped_adam(config.max_grad_norm), state.workspace
     filled = jnp.minimum(work.n_filled, config.plan_memory)
 
@@ -228,7 +223,7 @@ def _to_go(problem: Problem, plan: Plan, tail: jax.Array) -> Float[Array, " hori
 
 
 def _weight(quantity: jax.Array, share: float | jax.Array) -> jax.Array:
-    """A weight with mean near one, a share of it in proportion to ``quantity``."""
+    """:return: weights with a mean near one, a share of which is proportional to ``quantity``"""
     finite = jnp.where(jnp.isfinite(quantity), quantity, 0.0)
     relative = finite / (jnp.mean(finite) + 1e-6)
     return 1.0 - share + share * jnp.minimum(relative, _LARGEST_WEIGHT)
@@ -238,8 +233,8 @@ def learn_from_plans(
     config: EpochConfig, state: EpochState, hyper: Hyperparams
 ) -> tuple[EpochState, tuple[Any, Any, Any]]:
     """
-    The second half of an epoch: the regressions. That of the policy and that of the value know
-    nothing of each other, and with small networks one of them keeps little more than one core busy.
+    The second half of an epoch: the regressions of policy and value. They are independent and run
+    in parallel, since with small networks, each uses little more than one core.
 
     :return: the state; the mean losses of policy and value, and the mean norm of the policy's
         gradient before it is clipped
@@ -264,8 +259,8 @@ def regressions(config: EpochConfig) -> list[Callable[..., Any]]:
 
 def side_by_side(works: Sequence[Callable[[], Any]]) -> list[Any]:
     """
-    :param works: change nothing; the first is done in this thread
-    :return: what they returned
+    :param works: functions without side effects; the first one runs in this thread
+    :return: their results
     """
     first, *others = works
     if not others:
@@ -276,7 +271,7 @@ def side_by_side(works: Sequence[Callable[[], Any]]) -> list[Any]:
 
 
 def _next_keys(state: EpochState) -> jax.Array:
-    """:return: the random key after this half of the epoch, and the one for it"""
+    """:return: the random key after this half of the epoch, and the one to use in it"""
     return jax.random.split(jax.random.wrap_key_data(state.progress.key, impl=GENERATOR))
 
 
@@ -284,10 +279,10 @@ def choose_policy(
     config: EpochConfig, state: EpochState, hyper: Hyperparams, every: int, due: bool
 ) -> tuple[EpochState, Float[np.ndarray, " 2"] | None]:
     """
-    After an epoch: the average acts, until it was first compared; then the better one does.
+    After an epoch: the averaged policy acts until the first comparison, then the better one does.
 
-    :param every: epochs from one comparison to the next; 0: never
-    :param due: compare after this epoch in any case, unless never
+    :param every: epochs between two comparisons; 0: no comparisons
+    :param due: compare after this epoch in any case, unless ``every`` is 0
     :return: the state, and the returns of a comparison, see :func:`keep_better`
     """
     n_epochs = int(state.progress.n_epochs)
@@ -306,7 +301,7 @@ def is_compared(n_epochs: int, every: int, due: bool) -> bool:
 
 
 def comparison(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Callable[[], Any]:
-    """:return: the program of a comparison; running it once compiles it"""
+    """:return: the program of a comparison, to be compiled by running it once"""
     nets = state.networks
     given = (state.progress.key, nets.average, nets.inside)
     return partial(mean_return, config, hyper, *given)
@@ -321,9 +316,9 @@ def keep_better(
     config: EpochConfig, state: EpochState, hyper: Hyperparams
 ) -> tuple[EpochState, Float[np.ndarray, " 2"]]:
     """
-    Let the average and the policy that acts go through whole episodes of the twin, from the same
-    start states, and let the better one act: where a system falls over, a single epoch may spoil
-    what took many to learn.
+    Compare the averaged policy with the one that acts on full episodes of the twin from the same
+    start states, and let the better one act: for a system that can fall, a single epoch may spoil
+    the policy.
 
     :return: the state, and the mean return of both, in planning rewards
     """
@@ -348,17 +343,17 @@ def mean_return(
     inside: View,
 ) -> tuple[jax.Array, jax.Array]:
     """
-    :param key: random, as integers
-    :return: mean return of a policy over whole episodes of the twin, in planning rewards; the key
-        after that
+    :param key: random key, as integers
+    :return: mean return of a policy over full episodes of the twin, in planning rewards; the next
+        random key
     """
     after, k_starts = jax.random.split(jax.random.wrap_key_data(key, impl=GENERATOR))
     twin = config.twin
     problem = Problem(twin, hyper.params)
     starts = resets(twin, hyper.params, k_starts, _n_starts(twin))
     length = longest_episode(twin)
-    spread = np.linspace(0, config.n_rollouts - 1, _n_starts(twin)).round().astype(int)
-    varied = jax.tree.map(lambda leaf: leaf[spread], hyper.varied)
+    rollouts = np.linspace(0, config.n_rollouts - 1, _n_starts(twin)).round().astype(int)
+    varied = jax.tree.map(lambda leaf: leaf[rollouts], hyper.varied)
     policy = lambda obs: output(config.actor, actor, inside(hyper.view(obs)))  # noqa: E731
     value = lambda s, own: follow(problem.with_params(own), s, policy, length).value  # noqa: E731
     return jnp.mean(for_each(value, starts, varied)), jax.random.key_data(after)

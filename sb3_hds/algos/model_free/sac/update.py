@@ -129,6 +129,7 @@ class Extra(Protocol):
         :param noise: deviation from the actor's mean, before tanh
         :return: exploratory actions
         """
+        ...
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICK_COMPILATION)
@@ -195,10 +196,9 @@ def update_once(
             obs=normalize(state.obs_stats, batch.obs),
             next_obs=normalize(state.obs_stats, batch.next_obs),
         )
-    critics = partial(update_critics, config, batch, hyper)
     actor = partial(update_actor, config, batch, hyper)
     steps = [
-        UpdateStep(("critic",), 1, critics),
+        UpdateStep(("critic",), 1, partial(update_critics, config, batch, hyper)),
         UpdateStep(("actor", "log_ent_coef", "extra"), config.policy_delay, actor),
         UpdateStep(("target",), config.target_update_interval, partial(soft_update, hyper.tau)),
     ]
