@@ -17,9 +17,9 @@ from sb3_hds.algos.base.construct import as_list
 from sb3_hds.algos.twin.algorithm import TwinAlgorithm
 from sb3_hds.algos.twin.config import TwinConfig
 from sb3_hds.algos.twin.hds.correction import (
+    ChangePoint,
     Correction,
     CorrectionConfig,
-    Since,
     correct,
     names_to_estimate,
 )
@@ -205,7 +205,7 @@ class HDS(TwinAlgorithm):
         :return: the correction; None before anything was measured
         :raises NoTwinError: if the model was loaded without environment and without twin
         """
-        data, n_counted = self.measured.recordings(), self._since_change()
+        data, n_counted = self.measured.recordings(), self._steps_since_change()
         if data is None or self.twin is None:
             return None
         n_steps = data.n_steps if n_counted is None else min(data.n_steps, n_counted)
@@ -217,12 +217,12 @@ class HDS(TwinAlgorithm):
             self.model_beta,
             learn_force=n_steps >= _GROWTH * self._steps_at_force,
             n_new=self.real_timesteps - self._refitted_at,
-            since=None if n_counted is None else Since(n_counted, self._changed_in),
+            change=None if n_counted is None else ChangePoint(n_counted, self._changed_in),
         )
         found = by_data() if self.poll is nothing else meanwhile([by_data], self.poll)[0]
-        if found.since is not None:
-            self._changed_at = self.real_timesteps - found.since.n_steps
-            self._changed_in, self._steps_at_force = found.since.recording, 0
+        if found.change is not None:
+            self._changed_at = self.real_timesteps - found.change.n_steps
+            self._changed_in, self._steps_at_force = found.change.recording, 0
         self._refitted_at = self.real_timesteps
         if found.residual is not None:
             self._steps_at_force = n_steps
@@ -252,7 +252,7 @@ class HDS(TwinAlgorithm):
         :raises TrajectoryError: before anything was measured
         :raises NoTwinError: if the model was loaded without environment and without twin
         """
-        data = self.measured.trajectories(self._since_change())
+        data = self.measured.trajectories(self._steps_since_change())
         if data is None:
             raise TrajectoryError(
                 "Nothing was measured yet. Let the model learn(...) on the real system first."
@@ -271,7 +271,7 @@ class HDS(TwinAlgorithm):
         :param arguments: as of :func:`sb3_hds.diagnose`
         :return: the diagnosis; None before anything was measured
         """
-        if self.twin is None or self.measured.trajectories(self._since_change()) is None:
+        if self.twin is None or self.measured.trajectories(self._steps_since_change()) is None:
             return None
         nuisances = names_to_estimate(self.twin, self.config.calibrated)
         own = {"budget": "quick", "progress": False, "calibrate": nuisances} | arguments
@@ -299,7 +299,7 @@ class HDS(TwinAlgorithm):
         known = required(self.twin, self.twin_spec).parameters
         return any(name.startswith(f"{effect}.") for name in known)
 
-    def _since_change(self) -> int | None:
+    def _steps_since_change(self) -> int | None:
         """:return: real steps that count, where the system changed; None if all do"""
         return None if self._changed_at is None else self.real_timesteps - self._changed_at
 

@@ -10,13 +10,13 @@ from sb3_hds.algos.twin.hds.recorded_steps import last_steps
 from sb3_hds.algos.twin.hds.windows import (
     EXACT,
     FEWEST,
-    Since,
+    ChangePoint,
     Windows,
-    divided,
+    detect_change,
+    hold_out_windows,
     latest_windows,
-    mean_error,
+    rms,
     shares_of,
-    since_change,
     windows_of,
 )
 from sb3_hds.algos.twin.model import missing_effects, nulls_of
@@ -82,7 +82,7 @@ class Correction:
     :param twin: to plan in from now on
     :param beta: share of rollouts in the learned model
     :param changed: whether the model is so different that plans should be made again
-    :param since: what counts from now on, if data from before a change of the system were left out
+    :param change: what counts from now on, if data from before a change of the system were left out
     :param attached: nominal values of the parameters of effects that the twin has now and had
         not before
     :param fit: of the parameters, if they were estimated
@@ -95,7 +95,7 @@ class Correction:
     twin: Twin
     beta: float
     changed: bool
-    since: Since | None = None
+    change: ChangePoint | None = None
     attached: Mapping[str, float] = dataclasses.field(default_factory=dict)
     fit: Fit | None = None
     residual: Residual | None = None
@@ -108,7 +108,7 @@ class Correction:
         :return: by key, errors that there are and parameters as the twin has them now; and for
             those that it took over from the fit the ends of their intervals
         """
-        values: dict[str, float] = {"beta": self.beta, "forgotten": int(self.since is not None)}
+        values: dict[str, float] = {"beta": self.beta, "forgotten": int(self.change is not None)}
         for name in ("error_twin", "error_calibrated", "error_hybrid"):
             error = getattr(self, name)
             if not (np.isnan(error) or (name == "error_calibrated" and self.fit is None)):
@@ -135,7 +135,7 @@ def correct(
     beta: float,
     learn_force: bool,
     n_new: int,
-    since: Since | None = None,
+    change: ChangePoint | None = None,
 ) -> Correction:
     """
     Estimate parameters, then learn what remains; keep each only if held-out windows say so.
@@ -146,39 +146,41 @@ def correct(
     :param beta: as it is now
     :param learn_force: whether it is time to learn the force again
     :param n_new: steps that came since the last correction
-    :param since: what counts of the data; None: everything
+    :param change: what counts of the data; None: everything
     :raises CalibrationError: for data that cannot have been measured on what the twin simulates
     """
     check_fits(twin, data)
-    recent = data if since is None else last_steps(data, since.n_steps)
-    spread = spread_of(recent)
+    recent = data if change is None else last_steps(data, change.n_steps)
+    std = spread_of(recent)
     if twin.values == config.nominal:
-        single = single_step_errors(twin, recent, spread, _N_SINGLE)
+        single = single_step_errors(twin, recent, std, _N_SINGLE)
         typical = float(np.quantile(single, _MOST_STEPS))
         if typical < _EXACT_STEP:
             return Correction(twin, beta, changed=False, error_twin=typical)
     try:
-        windows = windows_of(data, twin, spread, since)
+        windows = windows_of(data, twin, std, change)
     except TrajectoryError:
         return Correction(twin, beta, changed=False)
     nominal = twin.with_parameters(**config.nominal)
-    bare, now = (windows.errors(t) for t in (nominal, twin))
+    nominal_errors, current_errors = (windows.errors(t) for t in (nominal, twin))
     real = windows.counted
     if len(real) < FEWEST:
-        return Correction(twin, beta, changed=False, error_twin=mean_error(bare[real]))
+        return Correction(twin, beta, changed=False, error_twin=rms(nominal_errors[real]))
     latest = latest_windows(windows, n_new)
-    if max(mean_error(bare[real]), mean_error(bare[latest])) < EXACT:
-        changed = gain(bare[real], now[real]) > _NOTICEABLE
-        return Correction(nominal, 0.0, changed=changed, error_twin=mean_error(bare[real]))
-    windows, forgotten = since_change(windows, now, latest, n_new)
-    windows = divided(windows, forgotten or since)
+    if max(rms(nominal_errors[real]), rms(nominal_errors[latest])) < EXACT:
+        changed = gain(nominal_errors[real], current_errors[real]) > _NOTICEABLE
+        return Correction(nominal, 0.0, changed=changed, error_twin=rms(nominal_errors[real]))
+    windows, new_change = detect_change(windows, current_errors, latest, n_new)
+    windows = hold_out_windows(windows, new_change or change)
     real = windows.counted
     if len(real) < FEWEST or not windows.held.any():
         return Correction(
-            twin, beta, changed=False, since=forgotten, error_twin=mean_error(bare[real])
+            twin, beta, changed=False, change=new_change, error_twin=rms(nominal_errors[real])
         )
-    found = _corrected(nominal, twin, config, windows, bare, now, beta, learn_force)
-    return dataclasses.replace(found, since=forgotten)
+    found = _corrected(
+        nominal, twin, config, windows, nominal_errors, current_errors, beta, learn_force
+    )
+    return dataclasses.replace(found, change=new_change)
 
 
 def _corrected(
@@ -186,20 +188,20 @@ def _corrected(
     twin: Twin,
     config: CorrectionConfig,
     windows: Windows,
-    bare: np.ndarray,
-    now: np.ndarray,
+    nominal_errors: np.ndarray,
+    current_errors: np.ndarray,
     beta: float,
     learn_force: bool,
 ) -> Correction:
     """
     :param nominal: as the twin was before any data
-    :param bare: errors of that
-    :param now: errors of the twin as it is
+    :param nominal_errors: errors of the nominal twin
+    :param current_errors: errors of the current twin
     """
-    nominal, twin, config, added = _with_suspects(nominal, twin, config)
+    nominal, twin, config, added = _add_suspects(nominal, twin, config)
     fit = _calibrated(nominal, twin, windows, config)
-    calibrated, errors = _best(nominal, twin, fit, bare, now, windows)
-    calibrated, errors, added = _cleared(calibrated, errors, added, windows)
+    calibrated, errors = _better_twin(nominal, twin, fit, nominal_errors, current_errors, windows)
+    calibrated, errors, added = _drop_useless_suspects(calibrated, errors, added, windows)
     held = windows.held
     found = Correction(
         calibrated,
@@ -207,16 +209,18 @@ def _corrected(
         changed=False,
         attached=added,
         fit=fit,
-        error_twin=mean_error(bare[held]),
-        error_calibrated=mean_error(errors[held]),
+        error_twin=rms(nominal_errors[held]),
+        error_calibrated=rms(errors[held]),
     )
     if beta > 0.0:
-        now = windows.errors(twin, twin.params)
+        current_errors = windows.errors(twin, twin.params)
     found, errors = _with_residual(found, windows, errors, config, learn_force)
-    return dataclasses.replace(found, changed=gain(errors[held], now[held]) > _NOTICEABLE)
+    return dataclasses.replace(
+        found, changed=gain(errors[held], current_errors[held]) > _NOTICEABLE
+    )
 
 
-def _with_suspects(
+def _add_suspects(
     nominal: Twin, twin: Twin, config: CorrectionConfig
 ) -> tuple[Twin, Twin, CorrectionConfig, dict[str, float]]:
     """
@@ -236,7 +240,7 @@ def _with_suspects(
     return nominal, twin, config, added
 
 
-def _cleared(
+def _drop_useless_suspects(
     twin: Twin,
     errors: np.ndarray,
     added: Mapping[str, float],
@@ -268,43 +272,45 @@ def _calibrated(
     """Starting from the current values, with the nominal model as prior."""
     if not config.names:
         return None
-    believed = np.array([nominal.values[name] for name in config.names])
-    start = twin.with_parameters(**{k: 0.0 for k in shares_of(twin)})
+    prior_values = np.array([nominal.values[name] for name in config.names])
+    start = twin.with_parameters(**dict.fromkeys(shares_of(twin), 0.0))
     try:
         return fit_windows(
             start,
             each(config.names),
             windows.learned,
             windows.origin,
-            windows.spread,
+            windows.std,
             prior=1.0,
-            believed=believed,
+            believed=prior_values,
             max_steps=_SOLVER_STEPS,
         )
     except CalibrationError:
         return None
 
 
-def _best(
+def _better_twin(
     nominal: Twin,
     twin: Twin,
     fit: Fit | None,
-    bare: np.ndarray,
-    now: np.ndarray,
+    nominal_errors: np.ndarray,
+    current_errors: np.ndarray,
     windows: Windows,
 ) -> tuple[Twin, np.ndarray]:
     """:return: the calibrated twin if it predicts better, otherwise the twin as it is or was"""
     held = windows.held
-    current = (twin, now) if now[held].mean() < bare[held].mean() else (nominal, bare)
+    current = nominal, nominal_errors
+    if current_errors[held].mean() < nominal_errors[held].mean():
+        current = twin, current_errors
     if fit is None or not all(np.isfinite(e.estimate) for e in fit.estimates):
         return current
-    if not windows.of_other_recordings and probability_before(fit, nominal) < _IMPROBABLE:
+    if not windows.held_out_by_recording and probability_before(fit, nominal) < _IMPROBABLE:
         return current
     new = twin.with_parameters(**{e.name: e.estimate for e in fit.estimates})
     errors = windows.errors(new)
     if (
-        gain(errors[held], bare[held]) > _LEAST_OF_CALIBRATION
-        and gain(errors[held], now[held]) >= 0.0
+        gain(errors[held], nominal_errors[held]) > _LEAST_OF_CALIBRATION
+        and gain(errors[held], current_errors[held]) >= 0.0
     ):
         return new, errors
     return current
@@ -319,10 +325,10 @@ def _with_residual(
 ) -> tuple[Correction, np.ndarray]:
     """:return: the correction, and the errors of the model that is planned in"""
     twin, residual, held = found.twin, None, windows.held
-    wanted = config.beta != 0.0 and mean_error(errors[held]) > EXACT
+    wanted = config.beta != 0.0 and rms(errors[held]) > EXACT
     if wanted and learn_force:
-        scale = 0.05 * windows.spread if found.fit is None else found.fit.noise
-        scale = np.maximum(scale, 1e-3 * windows.spread)
+        scale = 0.05 * windows.std if found.fit is None else found.fit.noise
+        scale = np.maximum(scale, 1e-3 * windows.std)
         try:
             residual = fit_force(
                 twin, windows.shots, held, scale, seed=config.seed, **config.residual_kwargs
@@ -334,7 +340,7 @@ def _with_residual(
     if key is None:
         return found, errors
     whole = windows.errors(hybrid, {**hybrid.params, key: 1.0})
-    found = dataclasses.replace(found, residual=residual, error_hybrid=mean_error(whole[held]))
+    found = dataclasses.replace(found, residual=residual, error_hybrid=rms(whole[held]))
     # Simulating a force that does not help costs time.
     if residual is not None and not (residual.accepted or shares_of(twin)):
         return found, errors

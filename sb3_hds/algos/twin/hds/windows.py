@@ -21,7 +21,7 @@ _N_WINDOWS = 128
 _HELD, _HELD_OF_FEW, _MANY = 0.25, 0.5, 24
 
 
-class Since(NamedTuple):
+class ChangePoint(NamedTuple):
     """
     The data that count after the system has changed.
 
@@ -41,7 +41,7 @@ class Windows(NamedTuple):
     :param origin: of each window, the recording it is from; negative where it does not count
     :param place: of each window in its recording
     :param age: of each window, steps from its beginning to the end of the data
-    :param spread: standard deviation of each channel
+    :param std: standard deviation of each channel
     :param held: whether each window is held out of what is learned from
     """
 
@@ -49,7 +49,7 @@ class Windows(NamedTuple):
     origin: np.ndarray
     place: np.ndarray
     age: np.ndarray
-    spread: Float[np.ndarray, " obs"]
+    std: Float[np.ndarray, " obs"]
     held: np.ndarray
 
     @property
@@ -58,7 +58,7 @@ class Windows(NamedTuple):
         return np.flatnonzero(self.origin >= 0)
 
     @property
-    def of_other_recordings(self) -> bool:
+    def held_out_by_recording(self) -> bool:
         """Whether nothing is learned from the recordings that windows are held out of."""
         learned = self.origin[~self.held & (self.origin >= 0)]
         return not np.isin(self.origin[self.held], learned).any()
@@ -71,21 +71,21 @@ class Windows(NamedTuple):
     def errors(self, twin: Twin, params: Params | None = None) -> np.ndarray:
         """:return: of each window, with these parameters; None: the twin's, without its force"""
         params = without_force(twin) if params is None else params
-        return window_errors(twin, params, self.shots, self.spread)
+        return window_errors(twin, params, self.shots, self.std)
 
 
 def windows_of(
-    data: Trajectories, twin: Twin, spread: Float[np.ndarray, " obs"], since: Since | None
+    data: Trajectories, twin: Twin, std: Float[np.ndarray, " obs"], change: ChangePoint | None
 ) -> Windows:
     """The latest windows, not yet divided into those to learn from and those to check on."""
     length = default_window(data)
     shots, origin = shots_of(data, length, twin, _N_WINDOWS, seed=None)
     place, age = places_of(data, length, _N_WINDOWS, seed=None)
-    windows = Windows(shots, origin, place, age, spread, np.zeros(len(origin), bool))
-    return windows if since is None else _without(windows, np.flatnonzero(age > since.n_steps))
+    windows = Windows(shots, origin, place, age, std, np.zeros(len(origin), bool))
+    return windows if change is None else _leave_out(windows, np.flatnonzero(age > change.n_steps))
 
 
-def _without(windows: Windows, left_out: np.ndarray) -> Windows:
+def _leave_out(windows: Windows, left_out: np.ndarray) -> Windows:
     weight, origin = windows.shots.weight.copy(), windows.origin.copy()
     weight[left_out], origin[left_out] = 0.0, -1
     return windows._replace(shots=windows.shots._replace(weight=weight), origin=origin)
@@ -98,14 +98,14 @@ def latest_windows(windows: Windows, n_new: int) -> np.ndarray:
     return counted[-max(FEWEST, n_latest) :]
 
 
-def since_change(
+def detect_change(
     windows: Windows, errors: np.ndarray, latest: np.ndarray, n_new: int
-) -> tuple[Windows, Since | None]:
+) -> tuple[Windows, ChangePoint | None]:
     """
     Leave out what was measured before the last correction, if the system has become another one.
     """
     older = np.setdiff1d(windows.counted, latest)
-    if len(older) < FEWEST or mean_error(errors[latest]) < EXACT:
+    if len(older) < FEWEST or rms(errors[latest]) < EXACT:
         return windows, None
     if not has_grown(errors[latest], errors[older]):
         return windows, None
@@ -113,12 +113,12 @@ def since_change(
     counted = windows.counted
     newest = counted[windows.age[counted] <= n_new]
     recording = windows.origin[newest[0] if len(newest) else counted[-1]]
-    return _without(windows, np.setdiff1d(counted, newest)), Since(n_new, int(recording))
+    return _leave_out(windows, np.setdiff1d(counted, newest)), ChangePoint(n_new, int(recording))
 
 
-def divided(windows: Windows, since: Since | None) -> Windows:
+def hold_out_windows(windows: Windows, change: ChangePoint | None) -> Windows:
     """Which windows are held out depends on nothing that moves on with the data."""
-    first = 0 if since is None else since.recording
+    first = 0 if change is None else change.recording
     number = np.where(windows.origin >= 0, windows.origin - first, -1)
     share = _HELD if len(windows.counted) >= _MANY else _HELD_OF_FEW
     return windows._replace(held=hold_out(number, windows.place, share))
@@ -135,6 +135,6 @@ def without_force(twin: Twin) -> dict[str, Any]:
     return twin.params | dict.fromkeys(shares_of(twin), 0.0)
 
 
-def mean_error(errors: np.ndarray) -> float:
+def rms(errors: np.ndarray) -> float:
     """:return: root mean square over windows; not a number of none"""
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
