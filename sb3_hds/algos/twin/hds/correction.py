@@ -1,4 +1,4 @@
-"""Correct the twin by what was measured: its parameters with those of effects, then a force."""
+"""Correction of the twin by measured data: parameters of twin and effects, then a learned force."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -33,36 +33,37 @@ from sb3_hds.sysid.estimation.prediction import (
 )
 from sb3_hds.sysid.estimation.residual_force import Residual, fit_force
 
-# As `EXACT`, for nearly all of the latest single steps, since at rest any twin is exact: how
-# little, which share, of how many.
-_EXACT_STEP, _MOST_STEPS, _N_SINGLE = 1e-4, 0.98, 256
-# Of the solver, in each of its passes: the next correction goes on where this one ends.
+# A twin is exact if this quantile of the errors of this number of latest single steps is below this
+# threshold. The quantile is high, since every twin is exact at rest.
+_EXACT_STEP, _QUANTILE, _N_SINGLE = 1e-4, 0.98, 256
+# Iterations of the solver per pass: the next correction continues from its result.
 _SOLVER_STEPS = 20
-# Plans are made again where the corrected model's error is lower by this share.
+# Relative decrease of the error after which plans are made again.
 _NOTICEABLE = 0.1
-# A calibrated twin needs less proof than a learned force: it has few parameters, and a prior.
+# Relative decrease of the error required of a calibrated twin: less than of a learned force, since
+# it has few parameters and a prior.
 _LEAST_OF_CALIBRATION = 0.02
-# A suspected effect stays where the error would be higher without it by this share.
+# Relative increase of the error without a suspected effect from which on the effect stays.
 _LEAST_OF_SUSPECT = 0.01
-# Where held-out windows are of the same few recordings, values that the prior holds for so
-# improbable are not accepted: a system that dry friction holds fast looks like a heavier one.
+# Probability under the prior below which parameters are rejected if held-out windows are from the
+# same recordings: a system that is stuck in dry friction looks like a heavier one.
 _IMPROBABLE = 1e-3
-# A learned force that lowers the error by this share is planned in exclusively.
+# Relative decrease of the error from which on all plans are made with the learned force.
 _TRUSTED = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
 class CorrectionConfig:
     """
-    What is corrected, and how.
+    Arguments of a correction.
 
-    :param names: parameters that are estimated; empty: none
-    :param nominal: values before any data, by name
+    :param names: parameters to estimate; empty: none
+    :param nominal: nominal values of parameters, by name
     :param residual_kwargs: further arguments of ``sysid.fit_residual``
     :param beta: share of rollouts in the learned model, or ``"auto"``; 0: no force is learned
-    :param seed: of whatever is drawn
-    :param suspected: effects that are estimated with the rest once the twin proves inexact, and
-        stay attached where they explain something
+    :param seed: of random numbers
+    :param suspected: effects that are estimated, too, if the twin is not exact, and stay attached
+        if they lower the error
     """
 
     names: tuple[str, ...]
@@ -77,19 +78,18 @@ class CorrectionConfig:
 class Correction:
     """
     Result of a correction. Errors are root mean squares over held-out windows, in standard
-    deviations of the channels; not a number where there was nothing to compare.
+    deviations of the channels; NaN if there was nothing to compare.
 
-    :param twin: to plan in from now on
+    :param twin: the corrected twin
     :param beta: share of rollouts in the learned model
-    :param changed: whether the model is so different that plans should be made again
-    :param change: what counts from now on, if data from before a change of the system were left out
-    :param attached: nominal values of the parameters of effects that the twin has now and had
-        not before
+    :param changed: whether the model has changed so much that plans should be made again
+    :param change: start of the data that count, if a change of the system was detected
+    :param attached: nominal values of the parameters of newly attached effects
     :param fit: of the parameters, if they were estimated
     :param residual: the learned force, if it was learned
-    :param error_twin: of the twin as it was before any data
-    :param error_calibrated: of the calibrated one
-    :param error_hybrid: of that with the learned force
+    :param error_twin: of the nominal twin
+    :param error_calibrated: of the calibrated twin
+    :param error_hybrid: of the calibrated twin with the learned force
     """
 
     twin: Twin
@@ -105,8 +105,8 @@ class Correction:
 
     def log(self) -> tuple[dict[str, float], dict[str, float]]:
         """
-        :return: by key, errors that there are and parameters as the twin has them now; and for
-            those that it took over from the fit the ends of their intervals
+        :return: by key, the errors and current parameters; and the limits of the intervals of
+            parameters whose estimates were accepted
         """
         values: dict[str, float] = {"beta": self.beta, "forgotten": int(self.change is not None)}
         for name in ("error_twin", "error_calibrated", "error_hybrid"):
@@ -138,23 +138,24 @@ def correct(
     change: ChangePoint | None = None,
 ) -> Correction:
     """
-    Estimate parameters, then learn what remains; keep each only if held-out windows say so.
+    Estimate parameters, then learn a residual force; accept each only if it predicts held-out
+    windows better.
 
-    :param twin: as it is now
-    :param data: everything measured, oldest first; ``origin`` numbers the recordings
-    :param config: what is corrected, and how
-    :param beta: as it is now
-    :param learn_force: whether it is time to learn the force again
-    :param n_new: steps that came since the last correction
-    :param change: what counts of the data; None: everything
-    :raises CalibrationError: for data that cannot have been measured on what the twin simulates
+    :param twin: the current twin
+    :param data: all measured data, oldest first; ``origin`` numbers the recordings
+    :param config: arguments
+    :param beta: the current share of rollouts in the learned model
+    :param learn_force: whether to learn the force again
+    :param n_new: number of steps since the last correction
+    :param change: start of the data that count; None: all data count
+    :raises CalibrationError: for data that do not fit the twin
     """
     check_fits(twin, data)
     recent = data if change is None else last_steps(data, change.n_steps)
     std = spread_of(recent)
     if twin.values == config.nominal:
         single = single_step_errors(twin, recent, std, _N_SINGLE)
-        typical = float(np.quantile(single, _MOST_STEPS))
+        typical = float(np.quantile(single, _QUANTILE))
         if typical < _EXACT_STEP:
             return Correction(twin, beta, changed=False, error_twin=typical)
     try:
@@ -194,7 +195,7 @@ def _corrected(
     learn_force: bool,
 ) -> Correction:
     """
-    :param nominal: as the twin was before any data
+    :param nominal: the twin before any data
     :param nominal_errors: errors of the nominal twin
     :param current_errors: errors of the current twin
     """
@@ -224,10 +225,10 @@ def _add_suspects(
     nominal: Twin, twin: Twin, config: CorrectionConfig
 ) -> tuple[Twin, Twin, CorrectionConfig, dict[str, float]]:
     """
-    Errors that are known already stay valid: new effects change nothing yet.
+    Attach suspected effects with nominal parameters, which leave the errors unchanged.
 
-    :return: both twins with the suspected effects, the config with their parameters, and what is
-        believed of these
+    :return: both twins with the suspected effects, the config with their parameters, and the
+        nominal values of these
     """
     missing = missing_effects(twin, config.suspected)
     if not missing:
@@ -247,20 +248,20 @@ def _drop_useless_suspects(
     windows: Windows,
 ) -> tuple[Twin, np.ndarray, dict[str, float]]:
     """
-    Detach suspected effects that explain nothing, since simulating them costs time; they are
-    estimated again next time.
+    Detach suspected effects that do not lower the error, since they cost simulation time; the next
+    correction estimates them again.
 
     :return: the twin without those effects, its errors, and ``added`` without their parameters
     """
-    left = dict(added)
+    remaining = dict(added)
     for key in dict.fromkeys(name.rpartition(".")[0] for name in added):
         own = {name: null for name, null in added.items() if name.startswith(f"{key}.")}
-        cleared = twin.with_parameters(**own)
-        without = windows.errors(cleared)
+        reduced = twin.with_parameters(**own)
+        without = windows.errors(reduced)
         if gain(errors[windows.held], without[windows.held]) < _LEAST_OF_SUSPECT:
-            twin, errors = cleared.without(key), without
-            left = {name: null for name, null in left.items() if name not in own}
-    return twin, errors, left
+            twin, errors = reduced.without(key), without
+            remaining = {name: null for name, null in remaining.items() if name not in own}
+    return twin, errors, remaining
 
 
 def _calibrated(
@@ -269,7 +270,7 @@ def _calibrated(
     windows: Windows,
     config: CorrectionConfig,
 ) -> Fit | None:
-    """Starting from the current values, with the nominal model as prior."""
+    """:return: the fit, started at the current values, with the nominal model as prior, if any"""
     if not config.names:
         return None
     prior_values = np.array([nominal.values[name] for name in config.names])
@@ -297,7 +298,7 @@ def _better_twin(
     current_errors: np.ndarray,
     windows: Windows,
 ) -> tuple[Twin, np.ndarray]:
-    """:return: the calibrated twin if it predicts better, otherwise the twin as it is or was"""
+    """:return: the best of calibrated, current and nominal twin, and its errors"""
     held = windows.held
     current = nominal, nominal_errors
     if current_errors[held].mean() < nominal_errors[held].mean():
@@ -323,7 +324,7 @@ def _with_residual(
     config: CorrectionConfig,
     learn_force: bool,
 ) -> tuple[Correction, np.ndarray]:
-    """:return: the correction, and the errors of the model that is planned in"""
+    """:return: the correction, and the errors of the model to plan in"""
     twin, residual, held = found.twin, None, windows.held
     wanted = config.beta != 0.0 and rms(errors[held]) > EXACT
     if wanted and learn_force:
@@ -341,7 +342,7 @@ def _with_residual(
         return found, errors
     whole = windows.errors(hybrid, {**hybrid.params, key: 1.0})
     found = dataclasses.replace(found, residual=residual, error_hybrid=rms(whole[held]))
-    # Simulating a force that does not help costs time.
+    # A force that does not lower the error only costs simulation time.
     if residual is not None and not (residual.accepted or shares_of(twin)):
         return found, errors
     helps = is_better(whole[held], errors[held])
@@ -357,6 +358,7 @@ def _with_residual(
 def names_to_estimate(twin: Twin, wanted: str | Sequence[str] | None) -> tuple[str, ...]:
     """
     :param wanted: ``"all"``, names of parameters, or None
+    :return: full names of the parameters to estimate
     :raises CalibrationError: for a name that the twin does not have
     """
     if wanted == "all":
