@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     #: every algorithm by its id in the zoo
     ALL: dict[str, Any]
 
+# Public names besides algorithms and policies.
 _OTHERS = {
     "Episodes": "model_free.sac.compiled",
     "ExecutedDictReplayBuffer": "base.algorithm",

@@ -1,4 +1,4 @@
-"""What an open-loop policy knows of the system that it moves: its time step and its joints."""
+"""What an open-loop policy needs to know of an environment: time step and joints."""
 
 import dataclasses
 import functools
@@ -18,20 +18,19 @@ from sb3_hds.wrappers.actuated_joints import (
 )
 from sb3_hds.wrappers.interval import interval_from
 
-# Resets, which differ from each other, that must agree on where a joint is in the observation.
+# Number of different resets in which an entry of the observation must equal a joint's state, and
+# the tolerance.
 _N_RESETS = 3
 _EQUAL = 1e-6
-# Of a joint without a range [rad] or [m].
-_WIDEST_OFFSET = np.pi
 
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
     """
-    Plain data, saved with a model.
+    Time step and joints of an environment, as plain data that are saved with a model.
 
-    :param dt: how long a step takes [s]
-    :param control: ``"track"``: actuators follow joint positions; ``"direct"``: oscillators are the
+    :param dt: time step [s]
+    :param control: ``"track"``: actuators track joint positions; ``"direct"``: oscillators are the
         commands
     :param names: of the actuated joints, in the order of the actuators
     :param lower: lower limit of each joint, or of each command
@@ -61,7 +60,7 @@ class Robot:
                 object.__setattr__(self, field.name, tuple(value))
 
     def to_dict(self) -> dict[str, Any]:
-        """:return: plain data for JSON, from which ``Robot(**data)`` makes it again"""
+        """:return: JSON data, the arguments of an equal robot"""
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in dataclasses.asdict(self).items()
@@ -84,12 +83,13 @@ class Robot:
 
 def robot_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Robot:
     """
-    Resets the environment a few times to find out where in its observations the joints are.
+    Reset the environment a few times to locate the joints in its observations.
 
-    :param control: ``"track"``, ``"direct"``, or ``"auto"``: track where actuators drive joints
+    :param control: ``"track"``, ``"direct"``, or ``"auto"``: track if actuators drive joints
     :param joints: ``"observation"``, ``"env"``, or ``"auto"``: the observation if it has them all
-    :param dt: how long a step takes [s]; None: as the environment says
-    :raises EnvironmentMismatchError: if the environment does not have what is asked for
+    :param dt: time step [s]; None: that of the environment
+    :raises EnvironmentMismatchError: if the environment does not allow this control, or does not
+        show the joints there
     """
     attribute, error = functools.partial(_attribute, env), EnvironmentMismatchError
     interval = (
@@ -179,7 +179,7 @@ def _commands(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
 def _in_observation(
     env: VecEnv, driven: ActuatedJoints
 ) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
-    """Entries of the observation that agree with the state at several resets, if there are all."""
+    """:return: indices of positions and velocities in the observation, if it has all of them"""
     space = env.observation_space
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         return None
@@ -191,7 +191,7 @@ def _in_observation(
     columns = []
     for truth in there:
         matches = np.abs(observed[:, :, None] - truth[:, None, :]).max(axis=0) < _EQUAL
-        # A joint that every reset puts at the same place cannot be told from other constants.
+        # A joint with the same state after every reset cannot be distinguished from constants.
         if not (matches.any(axis=0) & (np.ptp(truth, axis=0) > _EQUAL)).all():
             return None
         columns.append(tuple(np.argmax(matches, axis=0).tolist()))
