@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from sb3_hds.core import Flag, Scalar, State, solve_spd
+from sb3_hds.core import Scalar, State, solve_spd
 from sb3_hds.planning.expansion import Expansion, expand
 from sb3_hds.planning.line_search import choose, climb, step_sizes
 from sb3_hds.planning.problem import Control, Controls, Plan, Problem, roll_out, simulated
@@ -124,7 +124,8 @@ def ilqr(
     def iterate(carry, draw):
         plan, regularisation = carry
         gains = solve_backward(expand(problem, plan), plan.controls, regularisation)
-        gains = jax.tree.map(lambda leaf: jnp.where(_all_finite(gains), leaf, 0.0), gains)
+        finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in gains]))
+        gains = jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gains)
         candidates = jax.vmap(lambda step: _follow(problem, start, plan, gains, step))(steps)
         best = choose(candidates.value, temperature, None if key is None else draw)
         factor = jnp.where(best == 0, 10.0, 0.1).astype(dtype)
@@ -195,7 +196,3 @@ def _follow(problem: Problem, start: State, plan: Plan, gains: Gains, step: Scal
 
     stages = (reference, plan.controls, gains.feedforward, feedback)
     return roll_out(problem, start, decide, stages, plan.controls.shape[0])
-
-
-def _all_finite(gains: Gains) -> Flag:
-    return jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in gains]))

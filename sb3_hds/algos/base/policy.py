@@ -21,7 +21,7 @@ from sb3_hds.algos.base.files import (
     refuse_damaged,
     to_state_dict,
 )
-from sb3_hds.algos.nets.observations import flattener, size_of
+from sb3_hds.algos.nets.observations import flattener
 from sb3_hds.algos.nets.options import TrainState, by_names, widths
 from sb3_hds.core.numerics.compilation import GENERATOR
 
@@ -81,6 +81,20 @@ class TensorPolicy(BasePolicy):
 
     #: arguments of the constructor without the spaces
     arguments: dict[str, Any]
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
+
+    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
+        return self._predict(obs, deterministic)  # type: ignore[return-value]
+
+    def reset_noise(self, batch_size: int = 1) -> None:
+        """
+        Draw exploration noise again, if the policy has any that lasts several steps.
+
+        :param batch_size: number of environments
+        """
 
     def predict(  # type: ignore[override]
         self,
@@ -223,11 +237,10 @@ class LearningPolicy(TensorPolicy):
         self.arguments, net = config.arguments(), config.net_arch
         self.arguments["net_arch"] = dict(net) if isinstance(net, Mapping) else net
         self.widths = widths(net, "qf")
-        self.n_obs = size_of(config.observation_space)
+        self.n_obs = spaces.flatdim(config.observation_space)
         self.n_act = int(np.prod(config.action_space.shape))
         self.flatten = flattener(config.observation_space)
         self._agent_state: Any = None
-        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
 
     @abstractmethod
     def build_plain(self) -> None:
@@ -288,9 +301,6 @@ class LearningPolicy(TensorPolicy):
             numbers = ", ".join(f"{name}: {len(part)}" for name, part in rows.items())
             raise ValueError(f"predict() got different numbers of observations ({numbers}).")
         return rows, vectorized
-
-    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
-        return self._predict(obs, deterministic)  # type: ignore[return-value]
 
     @property
     def weights(self) -> Any:

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_hds.algos import registry
 from sb3_hds.algos.base.files import damaged, existing, name_of, refuse_damaged
@@ -155,7 +156,8 @@ def _built(description: Mapping[str, Any]) -> TensorPolicy:
         observation_space = space_from_plain(description["observation_space"])
         action_space: Any = space_from_plain(description["action_space"])
         arguments = description["arguments"]
-        policy = make(observation_space, action_space, lr_schedule=_no_rate, **arguments)  # type: ignore[call-arg]
+        no_rate = FloatSchedule(0.0)
+        policy = make(observation_space, action_space, lr_schedule=no_rate, **arguments)  # type: ignore[call-arg]
     # With arguments of an untrusted file, a constructor may raise anything.
     except Exception as error:
         raise ValueError(
@@ -171,7 +173,3 @@ def _cpu() -> Any:
         return jax.devices("cpu")[0]
     except RuntimeError:
         return jax.devices()[0]
-
-
-def _no_rate(_: float) -> float:
-    return 0.0

@@ -103,8 +103,13 @@ def batches_of(source: Source, n: int, batch_size: int, capacity: int) -> Batch:
     :return: arrays of shape ``(capacity, batch_size, ...)``
     """
     buffer = source.buffer
-    direct = type(buffer) is ReplayBuffer and not buffer.optimize_memory_usage
-    drawn = (_directly if direct else _over_torch)(source, n * batch_size)
+    if type(buffer) is ReplayBuffer and not buffer.optimize_memory_usage:
+        # Sample as ``ReplayBuffer.sample`` does, without torch.
+        size = n * batch_size
+        steps = np.random.randint(buffer.buffer_size if buffer.full else buffer.pos, size=size)
+        drawn = transitions(source, steps, np.random.randint(buffer.n_envs, size=size))
+    else:
+        drawn = _over_torch(source, n * batch_size)
     missing = (capacity - n) * batch_size
 
     def stacked(rows: np.ndarray) -> np.ndarray:
@@ -113,14 +118,6 @@ def batches_of(source: Source, n: int, batch_size: int, capacity: int) -> Batch:
         return rows.reshape(capacity, batch_size, *rows.shape[1:])
 
     return Batch(**{name: stacked(rows) for name, rows in drawn.items()})  # type: ignore[arg-type]
-
-
-def _directly(source: Source, n: int) -> dict[str, np.ndarray]:
-    """Sample as ``ReplayBuffer.sample`` does, without torch."""
-    buffer = source.buffer
-    steps = np.random.randint(buffer.buffer_size if buffer.full else buffer.pos, size=n)
-    copies = np.random.randint(buffer.n_envs, size=n)
-    return transitions(source, steps, copies)
 
 
 def transitions(source: Source, steps: np.ndarray, copies: np.ndarray) -> dict[str, np.ndarray]:

@@ -81,7 +81,7 @@ def check_observations(space: spaces.Space) -> None:
                 f"{what} is a MultiDiscrete with {len(part.shape)} axes, and SB3's replay buffers "
                 "take one: gymnasium.wrappers.FlattenObservation makes numbers of it."
             )
-    if size_of(space) == 0:
+    if spaces.flatdim(space) == 0:
         raise EnvironmentMismatchError(f"The observation has no numbers ({space}).")
 
 
@@ -109,15 +109,10 @@ def _is_gray_image(space: spaces.Box) -> bool:
     return len(space.shape) == 2 and of_bytes
 
 
-def size_of(space: spaces.Space) -> int:
-    """:return: numbers in a flat observation"""
-    return spaces.flatdim(space)
-
-
 def flattener(space: spaces.Space) -> Callable[[Any], np.ndarray]:
     """
     :return: function that maps observations with a leading axis, as environments and replay buffers
-        return them, to ``float32`` of shape ``(n, size_of(space))``; choices become one-hot
+        return them, to ``float32`` of shape ``(n, flatdim(space))``; choices become one-hot
     """
     if isinstance(space, spaces.Dict):
         parts = {name: flattener(part) for name, part in space.spaces.items()}

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
 
-from sb3_hds.algos.base.policy import TensorPolicy, TrainingTensors, refuse_odd
+from sb3_hds.algos.base.policy import TensorPolicy, refuse_odd
 from sb3_hds.algos.open_loop.cma_es import SearchState
 from sb3_hds.algos.open_loop.gait import Constants
 from sb3_hds.algos.open_loop.robot import Robot
@@ -86,7 +86,6 @@ class OscillatorPolicy(TensorPolicy):
         #: returns the states of all copies of the environment, if joints are not observed
         self.read_states: Callable[[], np.ndarray] | None = None
         self._lone_calls = 0
-        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
 
     @property
     def constants(self) -> Constants:
@@ -207,14 +206,8 @@ class OscillatorPolicy(TensorPolicy):
                 "action, state = model.predict(obs, state=state, episode_start=done)."
             )
 
-    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
-        return self.predict(obs)[0]
-
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
-        return self.predict(np.asarray(observation))[0]
-
-    def reset_noise(self, batch_size: int = 1) -> None:
-        """Nothing to reset: the policy is deterministic."""
+        return self.predict(observation)[0]
 
     @property
     def weights(self) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_hds.algos.base.config import takes
-from sb3_hds.algos.base.policy import PolicyConfig, TensorPolicy, TrainingTensors
+from sb3_hds.algos.base.policy import PolicyConfig, TensorPolicy
 from sb3_hds.algos.nets.options import Activation, activation, finite_leaves, widths
 from sb3_hds.algos.twin.networks import Actor, Value
 from sb3_hds.algos.twin.state import Networks, Progress, fresh_networks
@@ -68,7 +68,7 @@ class TwinPolicy(TensorPolicy):
         self.max_grad_norm = config.max_grad_norm
         self.networks: Networks
         self.progress: Progress
-        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
+
         self.build(jax.random.key(0, impl=GENERATOR), jax.devices()[0])
 
     def build(self, key: jax.Array, device: Any) -> None:
@@ -106,9 +106,6 @@ class TwinPolicy(TensorPolicy):
         placed = jax.device_put(key, self.progress.key.sharding)
         self.progress = tree._replace(key=placed)
 
-    def forward(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
-        return self._predict(obs, deterministic)
-
     def _predict(self, observation: np.ndarray, deterministic: bool = True) -> np.ndarray:  # type: ignore[override]
         flat = observation.reshape(observation.shape[0], -1)
         return np.asarray(_act(self.actor_network, self.networks, flat))
@@ -121,9 +118,6 @@ class TwinPolicy(TensorPolicy):
             squashed=True,
             scales=(np.asarray(inside.mean), np.asarray(inside.scale)),
         )
-
-    def reset_noise(self, batch_size: int = 1) -> None:
-        """Nothing to reset: the policy is deterministic."""
 
 
 @partial(jax.jit, static_argnums=0)

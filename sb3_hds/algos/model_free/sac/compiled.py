@@ -160,7 +160,10 @@ def _refuse_what_needs_python(model: Any, total_timesteps: Any, seeds: Sequence[
             not isinstance(model.observation_space, spaces.Box),
             "flatten them",
         ),
-        "layers with store='executed'": (_stores_executed(model.get_env()), "use store='raw'"),
+        "layers with store='executed'": (
+            _attribute(model.get_env(), "store") == "executed",
+            "use store='raw'",
+        ),
     }
     for what, (is_so, remedy) in unfit.items():
         if is_so:
@@ -170,12 +173,12 @@ def _refuse_what_needs_python(model: Any, total_timesteps: Any, seeds: Sequence[
             )
 
 
-def _stores_executed(env: Any) -> bool:
-    """:return: whether the outermost layer stores executed actions"""
+def _attribute(env: Any, name: str) -> Any:
+    """:return: of the environment, or of its outermost layer that has it; None: there is none"""
     try:
-        return "executed" in env.get_attr("store")
+        return env.get_attr(name)[0]
     except AttributeError:
-        return False
+        return None
 
 
 def _copy_of(model: Algorithm, seed: int) -> Algorithm:
@@ -196,7 +199,9 @@ def _loop_of(model: SoftActorCritic, total_timesteps: int, twin: Twin) -> Loop:
     return Loop(
         twin=twin,
         update_config=model.policy.update_config,
-        limit=_limit_of(env),
+        limit=_attribute(env, "_max_episode_steps")
+        or _attribute(env, "max_episode_steps")
+        or _NO_LIMIT,
         capacity=min(model.buffer_size, max(_LEAST_CAPACITY, next_power_of_2(n_steps))),
         learning_starts=model.learning_starts,
         train_freq=frequency,
@@ -206,16 +211,6 @@ def _loop_of(model: SoftActorCritic, total_timesteps: int, twin: Twin) -> Loop:
         sde_sample_freq=model.sde_sample_freq,
         warm=model.use_sde_at_warmup,
     )
-
-
-def _limit_of(env: Any) -> int:
-    """:return: steps after which the environment truncates an episode"""
-    for name in ("_max_episode_steps", "max_episode_steps"):
-        try:
-            return env.get_attr(name)[0] or _NO_LIMIT
-        except AttributeError:
-            continue
-    return _NO_LIMIT
 
 
 def _begun(loop: Loop, models: Sequence[SoftActorCritic], seeds: Sequence[int]) -> Run:

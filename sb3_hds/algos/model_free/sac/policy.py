@@ -105,7 +105,19 @@ class GaussianPolicyConfig(PolicyConfig):
         check_count("n_quantiles", self.n_quantiles)
         if self.renorm_warmup_steps is not None:
             check_count("renorm_warmup_steps", self.renorm_warmup_steps, 0)
-        _check_ranges(self)
+        ranges = {
+            "batch_norm_momentum": (0.0, 1.0, "from 0 to 1: the share that an update keeps"),
+            "log_std_init": (-math.inf, math.inf, "a finite number"),
+            "clip_mean": (0.0, math.inf, "a number of at least 0; 0 does not clip"),
+        }
+        for name, (low, high, allowed) in ranges.items():
+            if not between(value := getattr(self, name), low, high):
+                raise ValueError(f"{name} must be {allowed}, got {value!r}.")
+        rate, ortho_init = self.dropout_rate, self.ortho_init
+        if not (between(rate, 0.0, 1.0) and rate < 1.0):
+            raise ValueError(f"dropout_rate must be at least 0 and below 1, got {rate!r}.")
+        if ortho_init not in (True, False, "hidden"):
+            raise ValueError(f"ortho_init must be True, False or 'hidden', got {ortho_init!r}.")
         fields = dataclasses.fields(self)
         given = {field.name for field in fields if getattr(self, field.name) != field.default}
         has_batch_norm = self.renorm_warmup_steps is not None
@@ -346,22 +358,6 @@ class SimbaPolicy(GaussianPolicy):
 
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
         return networks.SimbaNet(net_arch, self.activation_fn, float(self.config.dropout_rate))
-
-
-def _check_ranges(config: GaussianPolicyConfig) -> None:
-    ranges = {
-        "batch_norm_momentum": (0.0, 1.0, "from 0 to 1: the share that an update keeps"),
-        "log_std_init": (-math.inf, math.inf, "a finite number"),
-        "clip_mean": (0.0, math.inf, "a number of at least 0; 0 does not clip"),
-    }
-    for name, (low, high, allowed) in ranges.items():
-        if not between(value := getattr(config, name), low, high):
-            raise ValueError(f"{name} must be {allowed}, got {value!r}.")
-    rate = config.dropout_rate
-    if not (between(rate, 0.0, 1.0) and rate < 1.0):
-        raise ValueError(f"dropout_rate must be at least 0 and below 1, got {rate!r}.")
-    if config.ortho_init not in (True, False, "hidden"):
-        raise ValueError(f"ortho_init must be True, False or 'hidden', got {config.ortho_init!r}.")
 
 
 @partial(jax.jit, static_argnums=0)

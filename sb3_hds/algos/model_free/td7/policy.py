@@ -140,9 +140,6 @@ class TD7Policy(LearningPolicy):
         )
         return tuple(np.asarray(values)[..., None])
 
-    def reset_noise(self, batch_size: int = 1) -> None:
-        """Nothing to reset: noise is added to the actions (``action_noise``)."""
-
 
 @partial(jax.jit, static_argnums=0)
 def _q_values(config: UpdateConfig, encoder: Any, critic: Any, obs: Any, actions: Any) -> jax.Array:

@@ -1,6 +1,6 @@
 """Windows of the measured data: which of them count, and which are held out."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -70,7 +70,8 @@ class Windows(NamedTuple):
 
     def errors(self, twin: Twin, params: Params | None = None) -> np.ndarray:
         """:return: error of each window with these parameters; None: the twin's, without force"""
-        params = without_force(twin) if params is None else params
+        if params is None:
+            params = twin.params | dict.fromkeys(shares_of(twin), 0.0)
         return window_errors(twin, params, self.shots, self.std)
 
 
@@ -126,11 +127,6 @@ def shares_of(twin: Twin) -> tuple[str, ...]:
     """:return: full name of the parameter that scales the learned force, if there is one"""
     force = force_of(twin)
     return () if force is None else (f"{force[0]}.share",)
-
-
-def without_force(twin: Twin) -> dict[str, Any]:
-    """:return: the twin's parameters with its learned force switched off"""
-    return twin.params | dict.fromkeys(shares_of(twin), 0.0)
 
 
 def rms(errors: np.ndarray) -> float:
