@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_hds import twins
 from sb3_hds.algos.twin.policy import all_finite
 from sb3_hds.algos.twin.regression import learn_policy, learn_value
-from sb3_hds.algos.twin.state import problem_of
+from sb3_hds.algos.twin.state import planning_problem
 from sb3_hds.core import Twin
 from sb3_hds.errors import RewardError
 
@@ -275,7 +275,7 @@ def test_what_an_end_is_worth_has_a_switch():
     worth = {}
     for shifted in (True, False):
         model = small("pods", "InvertedPendulum-v5", shift_ends=shifted)
-        problem = problem_of(model._program, model._epoch_state(), hyper_of(model, 4))
+        problem = planning_problem(model._program, model._epoch_state(), hyper_of(model, 4))
         worth[shifted] = float(problem.value_when_terminated)
         best = float(problem.reward_offset * problem.reward_scale)
     # A reward of zero for ever, counted from the best one; or nothing.

@@ -120,10 +120,12 @@ def gradient_ascent(
     :param temperature: annealed acceptance, see :func:`~sb3_hds.planning.line_search.choose`
     :param key: needed with a temperature
     """
-    return climb(problem, start, first, steepest, n_iterations, n_step_sizes, temperature, key)
+    return climb(
+        problem, start, first, steepest_direction, n_iterations, n_step_sizes, temperature, key
+    )
 
 
-def steepest(problem: Problem, plan: Plan) -> Controls:
+def steepest_direction(problem: Problem, plan: Plan) -> Controls:
     """:return: the gradient, scaled to a largest entry of one; zero where it is not finite"""
     gradient = control_gradient(expand(problem, plan, second_order=False))
     direction = gradient / jnp.maximum(jnp.max(jnp.abs(gradient)), 1e-30)

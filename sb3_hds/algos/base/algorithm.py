@@ -108,9 +108,9 @@ def _check_reached(space: spaces.Box, chosen: np.ndarray, info: Mapping[str, Any
     wanted = low + 0.5 * (chosen.reshape(space.shape) + 1.0) * (high - low)
     if not np.allclose(raw, wanted, rtol=0.0, atol=_REACHED * np.max(high - low)):
         raise ValueError(
-            f"A layer asks to store what was executed for the action {raw}, and {wanted} was "
-            "chosen. Some wrapper outside that layer changes actions, for example rescales them: "
-            "put it below, or use store='raw'."
+            f"A layer asks to store the executed form of action {raw}, but {wanted} was chosen. A "
+            "wrapper outside that layer changes actions, for example by rescaling them: move it "
+            "below the layer, or use store='raw'."
         )
 
 
@@ -120,8 +120,8 @@ def _scaled(space: spaces.Box, action: np.ndarray) -> np.ndarray:
     scaled = 2.0 * (action - low) / (high - low) - 1.0 if action.shape == space.shape else action
     if action.shape != space.shape or not np.all(np.abs(scaled) <= 1.0 + _ROUNDING):
         raise ValueError(
-            f"A layer asks to store the action {action}, which is not in {space}. Some wrapper "
-            "outside that layer rescales actions: put it below, or use store='raw'."
+            f"A layer asks to store the action {action}, which is not in {space}. A wrapper "
+            "outside that layer rescales actions: move it below the layer, or use store='raw'."
         )
     return np.clip(scaled, -1.0, 1.0)
 

@@ -226,7 +226,7 @@ def check_has_env(model: Any) -> None:
         )
 
 
-def whole_steps(total_timesteps: Any) -> int:
+def checked_timesteps(total_timesteps: Any) -> int:
     """
     :param total_timesteps: also as 1e5
     :raises ValueError: unless it is a whole number of at least 0

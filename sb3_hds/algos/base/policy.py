@@ -26,7 +26,7 @@ from sb3_hds.algos.nets.options import TrainState, by_names, widths
 from sb3_hds.core.numerics.compilation import GENERATOR
 
 
-def refuse_odd(observation: Any) -> None:
+def check_observation(observation: Any) -> None:
     """
     :raises ValueError: for the tuple that ``reset`` returns, anything that is not numeric, and
         observations that are not finite
@@ -109,7 +109,7 @@ class TensorPolicy(BasePolicy):
         :raises ValueError: if the observation has another shape than the observation space, or is
             not finite
         """
-        refuse_odd(observation)
+        check_observation(observation)
         batch, vectorized = self.prepare_obs(observation)
         actions = np.array(self._predict(batch, deterministic=deterministic))
         actions = actions.reshape(-1, *self.action_space.shape)  # type: ignore[misc]
@@ -223,7 +223,7 @@ class LearningPolicy(TensorPolicy):
     """
 
     #: further fields of the state that are saved with the weights, not with the training state
-    held: ClassVar[tuple[str, ...]]
+    saved_with_weights: ClassVar[tuple[str, ...]]
     #: hidden widths of the actor and of the critics
     widths: tuple[tuple[int, ...], tuple[int, ...]]
     #: width of critics that a CPU can train
@@ -243,7 +243,7 @@ class LearningPolicy(TensorPolicy):
         self._agent_state: Any = None
 
     @abstractmethod
-    def build_plain(self) -> None:
+    def build_default(self) -> None:
         """Initialise networks for a policy that is used without an algorithm."""
 
     @abstractmethod
@@ -263,7 +263,7 @@ class LearningPolicy(TensorPolicy):
         placed = jax.device_put(key, self.agent_state.key.sharding)
         self.agent_state = self.agent_state._replace(key=placed)
 
-    def forget_noise(self) -> None:
+    def discard_noise(self) -> None:
         """Discard exploration noise that lasts several steps, if there is any."""
 
     @property
@@ -275,7 +275,7 @@ class LearningPolicy(TensorPolicy):
     def agent_state(self) -> Any:
         """The state that updates change."""
         if self._agent_state is None:
-            self.build_plain()
+            self.build_default()
         return self._agent_state
 
     @agent_state.setter
@@ -306,11 +306,11 @@ class LearningPolicy(TensorPolicy):
     def weights(self) -> Any:
         fields = self.agent_state._asdict()
         networks = {n: part.weights for n, part in fields.items() if isinstance(part, TrainState)}
-        return networks | {name: fields[name] for name in self.held}
+        return networks | {name: fields[name] for name in self.saved_with_weights}
 
     @weights.setter
     def weights(self, tree: Any) -> None:
-        self._take("weights", tree)
+        self._replace_parts("weights", tree)
 
     @property
     def training_state(self) -> Any:
@@ -319,7 +319,7 @@ class LearningPolicy(TensorPolicy):
         state = {
             name: part.optimizer if isinstance(part, TrainState) else part
             for name, part in fields.items()
-            if name not in self.held
+            if name not in self.saved_with_weights
         }
         return state | {"key": np.asarray(jax.random.key_data(fields["key"]), np.int64)}
 
@@ -328,9 +328,9 @@ class LearningPolicy(TensorPolicy):
         data = jnp.asarray(np.asarray(tree["key"]).astype(np.uint32))
         key = jax.random.wrap_key_data(data, impl=GENERATOR)
         placed = jax.device_put(key, self.agent_state.key.sharding)
-        self._take("optimizer", tree | {"key": placed})
+        self._replace_parts("optimizer", tree | {"key": placed})
 
-    def _take(self, of_networks: str, tree: Any) -> None:
+    def _replace_parts(self, of_networks: str, tree: Any) -> None:
         before = self.agent_state._asdict()
         after = {
             name: before[name]._replace(**{of_networks: part})

@@ -20,10 +20,10 @@ from sb3_hds.algos.base.construct import (
     callbacks_of,
     check_has_env,
     checked_env,
+    checked_timesteps,
     device_or_cpu,
     in_one_line,
     policy_and_env,
-    whole_steps,
 )
 from sb3_hds.algos.base.files import damage_reported, name_of, refuse_damaged, write_whole
 from sb3_hds.algos.base.policy_file import described
@@ -196,7 +196,7 @@ class SavesTensors(BaseAlgorithm):
         self, total_timesteps: int, *args: Any, **kwargs: Any
     ) -> tuple[int, BaseCallback]:
         check_has_env(self)
-        return super()._setup_learn(whole_steps(total_timesteps), *args, **kwargs)
+        return super()._setup_learn(checked_timesteps(total_timesteps), *args, **kwargs)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         return super()._init_callback(callbacks_of(callback), progress_bar)  # type: ignore[arg-type]

@@ -217,7 +217,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             if name not in silent:
                 self.logger.record(f"train/{name}", value)
 
-    def _take(self, state: Any, report: dict[str, float]) -> None:
+    def _accept(self, state: Any, report: dict[str, float]) -> None:
         """
         Accept the state after an update.
 
@@ -225,7 +225,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         :raises DivergedError: if it diverged; the model keeps its last finite state
         """
         if not all(map(math.isfinite, report.values())):
-            self._give_up(f"an update diverged ({report})")
+            self._raise_diverged(f"an update diverged ({report})")
         self._before, self.policy.agent_state = self.policy.agent_state, state
 
     def remedies(self, updates_per_step: float) -> list[str]:
@@ -244,13 +244,13 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         return [*found, "a GPU"]
 
     def check_weights(self) -> None:
-        if not finite_leaves(_trained(self.policy.agent_state)):
-            self._give_up("an update made weights that are not finite")
+        if not finite_leaves(_train_states(self.policy.agent_state)):
+            self._raise_diverged("an update made weights that are not finite")
 
-    def _give_up(self, what: str) -> NoReturn:
-        if self._before is not None and not finite_leaves(_trained(self.policy.agent_state)):
+    def _raise_diverged(self, what: str) -> NoReturn:
+        if self._before is not None and not finite_leaves(_train_states(self.policy.agent_state)):
             self.policy.agent_state = self._before
-            self.policy.forget_noise()
+            self.policy.discard_noise()
         raise DivergedError(
             f"{type(self).__name__}: {what}. The model keeps its last good state; lower "
             "learning_rate, or scale rewards."
@@ -261,7 +261,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     ) -> tuple[np.ndarray, np.ndarray]:
         actions = super()._sample_action(learning_starts, action_noise, n_envs)
         if not np.isfinite(actions[1]).all():
-            self._give_up("its actions are not finite")
+            self._raise_diverged("its actions are not finite")
         return actions
 
     def _setup_learn(
@@ -366,9 +366,9 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             held = self.replay_buffer_kwargs.items()
             own = {name: value for name, value in held if name not in ("n_steps", "gamma")}
             self.replay_buffer_kwargs = own
-        self.replay_buffer_class = self._usual_buffer()
+        self.replay_buffer_class = self._default_buffer()
 
-    def _usual_buffer(self) -> type[ReplayBuffer] | None:
+    def _default_buffer(self) -> type[ReplayBuffer] | None:
         """:return: the class that is used if none is passed; None: SB3's default"""
         return None
 
@@ -382,7 +382,7 @@ def _are_rising_steps(given: Any) -> bool:
     return all(before < after for before, after in itertools.pairwise(given))
 
 
-def _trained(state: Any) -> list[Any]:
+def _train_states(state: Any) -> list[Any]:
     """:return: the networks of the state with their optimisers"""
     parts = jax.tree.leaves(state, is_leaf=lambda part: isinstance(part, TrainState))
     return [part for part in parts if isinstance(part, TrainState)]

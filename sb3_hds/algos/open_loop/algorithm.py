@@ -19,8 +19,8 @@ from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.base.construct import (
     check_log_interval,
     check_origin,
+    checked_timesteps,
     jax_device,
-    whole_steps,
 )
 from sb3_hds.algos.base.policy import TensorPolicy
 from sb3_hds.algos.base.saving import SavesTensors
@@ -101,7 +101,7 @@ class OpenLoop(SavesTensors):
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         if self.env is not None:
-            self._meet(self.env)
+            self._inspect_env(self.env)
         assert self.robot is not None
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space,
@@ -110,7 +110,7 @@ class OpenLoop(SavesTensors):
             robot=self.robot,
             **self.policy_kwargs,
         )
-        self._bind()
+        self._choose_joint_source()
         self._restart(np.zeros(self.gait_space.dim))
         self.policy.constants = self.gait_space.decode(self.policy.search.mean)
 
@@ -193,7 +193,7 @@ class OpenLoop(SavesTensors):
         if self.env is before:
             return
         assert self.env is not None
-        self._meet(self.env)
+        self._inspect_env(self.env)
         assert robot is not None and self.robot is not None
         if self.robot["names"] != robot["names"]:
             raise EnvironmentMismatchError(
@@ -202,7 +202,7 @@ class OpenLoop(SavesTensors):
             )
         self.policy.robot = Robot(**self.robot)
         self.policy.constants = self.policy.constants
-        self._bind()
+        self._choose_joint_source()
 
     def learn(
         self,
@@ -224,7 +224,9 @@ class OpenLoop(SavesTensors):
         :param progress_bar: whether to show a progress bar
         """
         check_log_interval(log_interval)
-        total = whole_steps(self.default_timesteps if total_timesteps is None else total_timesteps)
+        total = checked_timesteps(
+            self.default_timesteps if total_timesteps is None else total_timesteps
+        )
         name = tb_log_name or type(self).__name__
         total_timesteps, callback = self._setup_learn(
             total, callback, reset_num_timesteps, name, progress_bar
@@ -348,7 +350,7 @@ class OpenLoop(SavesTensors):
             config.n_elites,
         )
 
-    def _meet(self, env: VecEnv) -> None:
+    def _inspect_env(self, env: VecEnv) -> None:
         """
         Determine joints and time step of an environment.
 
@@ -370,7 +372,7 @@ class OpenLoop(SavesTensors):
             )
         self.robot = robot.to_dict()
 
-    def _bind(self) -> None:
+    def _choose_joint_source(self) -> None:
         """Read joints from the environment if the observation does not contain them."""
         robot = self.policy.robot
         assert robot is not None

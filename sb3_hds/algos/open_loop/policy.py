@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
 
-from sb3_hds.algos.base.policy import TensorPolicy, refuse_odd
+from sb3_hds.algos.base.policy import TensorPolicy, check_observation
 from sb3_hds.algos.open_loop.cma_es import SearchState
 from sb3_hds.algos.open_loop.gait import Constants
 from sb3_hds.algos.open_loop.robot import Robot
@@ -116,7 +116,7 @@ class OscillatorPolicy(TensorPolicy):
         :raises EnvironmentMismatchError: if joints must be read from an environment and the policy
             has none
         """
-        refuse_odd(observation)
+        check_observation(observation)
         rows, several = self._as_rows(observation)
         n = len(next(iter(rows.values()))) if isinstance(rows, dict) else len(rows)
         if state is None:

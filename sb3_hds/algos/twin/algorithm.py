@@ -35,7 +35,7 @@ from sb3_hds.algos.twin.model import (
     view_of,
 )
 from sb3_hds.algos.twin.policy import TwinPolicy, all_finite
-from sb3_hds.algos.twin.pretraining import Pretraining, beside, meanwhile, nothing
+from sb3_hds.algos.twin.pretraining import Pretraining, no_poll, run_in_thread, run_in_threads
 from sb3_hds.algos.twin.regression import (
     choose_policy,
     comparison,
@@ -102,7 +102,7 @@ class TwinAlgorithm(TensorAlgorithm):
         self._comparison: Callable[[], Any] | None = None
         # Whether a callback ended the training, and a function to call while programs compile.
         self.stopped = False
-        self.poll: Callable[[], None] = nothing
+        self.poll: Callable[[], None] = no_poll
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """One planning epoch with ``gradient_steps`` regression steps, between real steps."""
@@ -142,17 +142,17 @@ class TwinAlgorithm(TensorAlgorithm):
         n_epochs = int(self.policy.progress.n_epochs)
         hyper = self.hyperparams(program.twin, gradient_steps)
         if program != self._compiled:
-            meanwhile(programs(program, state, hyper), self.poll)
+            run_in_threads(programs(program, state, hyper), self.poll)
             self._compiled, self._comparison = program, None
         # Compile the comparison in another thread during the epochs before it is due.
         ahead = max(1, self._epochs_planned - self._epochs_done)
         compares = every > 0 and (self.comparison_due or n_epochs % every + ahead >= every)
         if compares and self._comparison is None:
-            self._comparison = beside(comparison(program, state, hyper)).result
+            self._comparison = run_in_thread(comparison(program, state, hyper)).result
         state, metrics = epoch(program, state, hyper)
         if self._comparison and is_compared(n_epochs + 1, every, self.comparison_due):
-            meanwhile([self._comparison], self.poll)
-            self._comparison = nothing
+            run_in_threads([self._comparison], self.poll)
+            self._comparison = no_poll
         state, returns = choose_policy(program, state, hyper, every, self.comparison_due)
         losses = float(metrics.policy_loss), float(metrics.value_loss)
         if not (all(map(math.isfinite, losses)) and all_finite(state.networks)):
@@ -200,7 +200,7 @@ class TwinAlgorithm(TensorAlgorithm):
         before = self.env, self.n_envs, self._vec_normalize_env, self._last_obs
         super().set_env(env, force_reset)
         try:
-            self._meet_env()
+            self._match_env()
         except Exception:
             self.env, self.n_envs, self._vec_normalize_env, self._last_obs = before
             raise
@@ -233,9 +233,9 @@ class TwinAlgorithm(TensorAlgorithm):
             self.twin = twin_from_spec(self.twin_spec)
         if self.twin is not None:
             self.twin_spec = self.twin.to_spec()
-        self._meet_env()
+        self._match_env()
 
-    def _meet_env(self) -> None:
+    def _match_env(self) -> None:
         """Plan with the twin of the environment, unless one was passed."""
         twin = self.twin
         if self.env is not None:
@@ -246,12 +246,12 @@ class TwinAlgorithm(TensorAlgorithm):
         if twin is not None:
             check_methods(twin)
             check_reward(twin)
-            twin = self._prepared(twin)
+            twin = self._prepare_twin(twin)
             if self.twin is not None and (twin != self.twin or twin.values != self.twin.values):
                 self._workspace = None
         self.twin = twin
 
-    def _prepared(self, twin: Twin) -> Twin:
+    def _prepare_twin(self, twin: Twin) -> Twin:
         """:return: the twin to plan in, given the environment's twin or the one that was passed"""
         return twin
 
@@ -297,7 +297,7 @@ class TwinAlgorithm(TensorAlgorithm):
                 prepare_statistics(self._vec_normalize_env, program.twin, jax.random.key(seed))
             view, params = self._view(program.twin), program.twin.params
             started = partial(init_workspace, program, params, view, policy.progress)
-            [(workspace, scales, progress)] = meanwhile([started], self.poll)
+            [(workspace, scales, progress)] = run_in_threads([started], self.poll)
             if fresh:
                 policy.networks = policy.networks._replace(inside=scales.inside)
                 progress = progress._replace(

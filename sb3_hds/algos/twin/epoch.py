@@ -26,9 +26,9 @@ from sb3_hds.algos.twin.state import (
     EpochConfig,
     EpochState,
     Hyperparams,
-    for_each,
+    grouped_vmap,
     longest_episode,
-    problem_of,
+    planning_problem,
     resets,
 )
 from sb3_hds.core import Obs, Params, State
@@ -142,15 +142,15 @@ def plan_ahead(
     """The first half of an epoch: rollouts and planning in the twin."""
     key = jax.random.wrap_key_data(state.progress.key, impl=GENERATOR)
     key, k_noise, k_plan, k_move = jax.random.split(key, 4)
-    problem = problem_of(config, state, hyper)
+    problem = planning_problem(config, state, hyper)
     starts = state.workspace.starts
-    own, wandering = _act(config, state, hyper, problem, starts, k_noise)
+    own, exploring = _roll_out(config, state, hyper, problem, starts, k_noise)
     choice = _plan(config, state, hyper, problem, own, k_plan)
     gain = jnp.maximum(choice.kept.value - choice.own.value, 0.0)
     samples, finite = samples_of(
         hyper, problem, choice.kept, choice.tails, gain, choice.sensitivity
     )
-    moved, ages = _move_on(config, state, hyper, wandering, k_move)
+    moved, ages = _advance_starts(config, state, hyper, exploring, k_move)
     outcome = _outcome(config, state, choice, finite)
     state = remember(config, state, samples)
     if config.adapt_scales:
@@ -180,7 +180,7 @@ def twin_steps_per_epoch(config: EpochConfig) -> int:
     return acting + planning + (2 * n + n_random) * s.lookahead
 
 
-def _act(
+def _roll_out(
     config: EpochConfig,
     state: EpochState,
     hyper: Hyperparams,
@@ -199,11 +199,11 @@ def _act(
     noise = hyper.noise * state.progress.control_scale
     offsets = noise * jax.random.normal(key, (n, problem.n_controls))
     if not config.advance:
-        own = for_each(act, starts, jnp.zeros_like(offsets), hyper.varied)
+        own = grouped_vmap(act, starts, jnp.zeros_like(offsets), hyper.varied)
         return own, own
-    rows, varied = _joined(starts, starts), _joined(hyper.varied, hyper.varied)
-    paths = for_each(act, rows, jnp.concatenate([jnp.zeros_like(offsets), offsets]), varied)
-    return _pick(paths, slice(n)), _pick(paths, slice(n, None))
+    rows, varied = _concatenated(starts, starts), _concatenated(hyper.varied, hyper.varied)
+    paths = grouped_vmap(act, rows, jnp.concatenate([jnp.zeros_like(offsets), offsets]), varied)
+    return _rows(paths, slice(n)), _rows(paths, slice(n, None))
 
 
 def _plan(
@@ -216,41 +216,41 @@ def _plan(
 ) -> Choice:
     """Improve the policy's own and random plans, and choose the plan to keep for each start."""
     k_random, k_improve, k_keep = jax.random.split(key, 3)
-    n, fresh = config.n_rollouts, _random_slots(config)
+    n, slots = config.n_rollouts, _random_slots(config)
     policy = partial(control_of, config, state, hyper)
-    first, tried = own, _pick(hyper.varied, fresh)
+    first, tried = own, _rows(hyper.varied, slots)
     varied = hyper.varied
-    if fresh.size:
+    if slots.size:
         # Without the barrier, XLA repeats the gather in every step of the loops.
-        starts = jax.tree.map(lambda leaf: leaf[fresh, 0], own.states)
+        starts = jax.tree.map(lambda leaf: leaf[slots, 0], own.states)
         starts = jax.lax.optimization_barrier(starts)
 
         def search(start: State, key: PRNGKeyArray, varied: Params) -> Plan:
             here = problem.with_params(varied)
             return best_of_random(here, start, key, config.horizon, config.n_candidates)
 
-        found = jax.vmap(search)(starts, jax.random.split(k_random, fresh.size), tried)
-        first, varied = _joined(own, found), _joined(varied, tried)
+        found = jax.vmap(search)(starts, jax.random.split(k_random, slots.size), tried)
+        first, varied = _concatenated(own, found), _concatenated(varied, tried)
     improved, sensitivity = _improve(config, state, hyper, problem, first, varied, k_improve)
 
-    plans, varied = _joined(improved, own), _joined(varied, hyper.varied)
+    plans, varied = _concatenated(improved, own), _concatenated(varied, hyper.varied)
     ends = jax.tree.map(lambda leaf: leaf[:, -1], plans.states)
     value_of_end = lambda end, own: _tail(config, problem.with_params(own), policy, end)  # noqa: E731
-    tails = for_each(value_of_end, ends, varied)
+    tails = grouped_vmap(value_of_end, ends, varied)
     values = jax.vmap(lambda p, tail: score(problem, p.rewards, p.alive, tail))(plans, tails)
     plans = plans._replace(value=values)
 
-    others = n + np.arange(fresh.size)
-    better = values[others] > values[fresh] + _TIE
-    best = jnp.arange(n).at[fresh].set(jnp.where(better, others, fresh))
-    unchanged = n + fresh.size + jnp.arange(n)
+    random_plans = n + np.arange(slots.size)
+    better = values[random_plans] > values[slots] + _TIE
+    best = jnp.arange(n).at[slots].set(jnp.where(better, random_plans, slots))
+    unchanged = n + slots.size + jnp.arange(n)
     advantage = values[best] - values[unchanged]
     if config.annealed:
         temperature = hyper.temperature * state.progress.gain
         advantage += temperature * jax.random.logistic(k_keep, (n,))
     kept = jnp.where(advantage > 0.0, best, unchanged)
     return Choice(
-        _pick(plans, unchanged), _pick(plans, kept), _pick(tails, kept), _pick(sensitivity, best)
+        _rows(plans, unchanged), _rows(plans, kept), _rows(tails, kept), _rows(sensitivity, best)
     )
 
 
@@ -299,22 +299,22 @@ def _tail(config: EpochConfig, problem: Problem, policy, end: State) -> jax.Arra
     return follow(problem, end, policy, config.lookahead).value
 
 
-def _move_on(
-    config: EpochConfig, state: EpochState, hyper: Hyperparams, wandering: Plan, key: PRNGKeyArray
+def _advance_starts(
+    config: EpochConfig, state: EpochState, hyper: Hyperparams, exploring: Plan, key: PRNGKeyArray
 ) -> tuple[State, Float[Array, " rollouts"]]:
     """:return: the next start states, from the rollouts with exploration noise or resets; ages"""
     n = config.n_rollouts
     k_reset, k_draw = jax.random.split(key)
-    fresh = resets(config.twin, hyper.params, k_draw, n)
+    reset_states = resets(config.twin, hyper.params, k_draw, n)
     if not config.advance:
-        return fresh, jnp.zeros(n)
-    moved = jax.tree.map(lambda leaf: leaf[:, config.advance], wandering.states)
+        return reset_states, jnp.zeros(n)
+    moved = jax.tree.map(lambda leaf: leaf[:, config.advance], exploring.states)
     ages = state.workspace.ages + config.advance
     finite = jnp.isfinite(moved.q).all(1) & jnp.isfinite(moved.v).all(1)
     too_old = ages >= longest_episode(config.twin)
     drawn = jax.random.uniform(k_reset, (n,)) < _reset_rates(hyper.reset_share, n)
-    again = too_old | drawn | ~wandering.alive[:, config.advance] | ~finite
-    return _where(again, fresh, moved), jnp.where(again, 0.0, ages)
+    again = too_old | drawn | ~exploring.alive[:, config.advance] | ~finite
+    return _choose_rows(again, reset_states, moved), jnp.where(again, 0.0, ages)
 
 
 def _reset_rates(share: float, n: int) -> Float[Array, " rollouts"]:
@@ -343,17 +343,17 @@ def _mean(values: jax.Array, counted: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(counted, values, 0.0)) / jnp.maximum(jnp.sum(counted), 1)
 
 
-def _joined(one, other):
+def _concatenated(one, other):
     """:return: the rows of both"""
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), one, other)
 
 
-def _pick(tree, index):
+def _rows(tree, index):
     """:return: the rows ``index`` of every leaf"""
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def _where(condition, new, old):
+def _choose_rows(condition, new, old):
     """Choose row by row."""
     rows = lambda leaf: condition.reshape(-1, *[1] * (leaf.ndim - 1))  # noqa: E731
     return jax.tree.map(lambda a, b: jnp.where(rows(a), a, b), new, old)

@@ -44,7 +44,7 @@ class Pretraining(CallbackList):
     def _on_training_start(self) -> None:
         super()._on_training_start()
         model: Any = self.model
-        self.update_locals(_no_step(model))
+        self.update_locals(_step_placeholder(model))
         model.poll = self._poll
         try:
             with _own_series(model), _counts_restored(self.callbacks):
@@ -52,14 +52,16 @@ class Pretraining(CallbackList):
         except _StoppedError:
             model.stopped = True
         finally:
-            model.poll = nothing
+            model.poll = no_poll
             self.update_locals({"pretraining": False})
 
     def _run(self, model: Any) -> None:
         model.before_planning()
         due = model.pretraining_due
         every = max(1, due // _N_LOGS)
-        bars = [each for each in _each(self.callbacks) if isinstance(each, ProgressBarCallback)]
+        bars = [
+            each for each in _flattened(self.callbacks) if isinstance(each, ProgressBarCallback)
+        ]
         for i in self._shown(range(1, due + 1)):
             model.pretrain_epoch()
             for bar in bars:
@@ -123,11 +125,11 @@ class OwnSeries(Logger):
             kept.clear()
 
 
-def nothing() -> None:
-    """Do nothing: the value of ``poll`` outside the pretraining."""
+def no_poll() -> None:
+    """Do no_poll: the value of ``poll`` outside the pretraining."""
 
 
-def beside(work: Callable[[], Any]) -> Future[Any]:
+def run_in_thread(work: Callable[[], Any]) -> Future[Any]:
     """
     :param work: a function without side effects
     :return: its future result; it runs in another thread, for which Python waits before it exits
@@ -139,7 +141,7 @@ def beside(work: Callable[[], Any]) -> Future[Any]:
         pool.shutdown(wait=False)
 
 
-def meanwhile(works: Sequence[Callable[[], Any]], poll: Callable[[], None]) -> list[Any]:
+def run_in_threads(works: Sequence[Callable[[], Any]], poll: Callable[[], None]) -> list[Any]:
     """
     Run functions in other threads, so that this one can be interrupted.
 
@@ -160,7 +162,7 @@ def meanwhile(works: Sequence[Callable[[], Any]], poll: Callable[[], None]) -> l
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _no_step(model: Any) -> dict[str, Any]:
+def _step_placeholder(model: Any) -> dict[str, Any]:
     """:return: ``locals`` for callbacks in place of those of a step"""
     space: Any = model.action_space
     n_envs = model.n_envs
@@ -184,11 +186,11 @@ def _no_step(model: Any) -> dict[str, Any]:
     }
 
 
-def _each(callbacks: Iterable[BaseCallback]) -> Iterator[BaseCallback]:
+def _flattened(callbacks: Iterable[BaseCallback]) -> Iterator[BaseCallback]:
     """:return: all callbacks, also those in nested lists"""
     for callback in callbacks:
         if type(callback) is CallbackList:
-            yield from _each(callback.callbacks)
+            yield from _flattened(callback.callbacks)
         else:
             yield callback
 
@@ -198,7 +200,7 @@ def _call(callbacks: Iterable[BaseCallback], *but: type[BaseCallback]) -> None:
     :param but: classes of callbacks that are not called
     :raises _StoppedError: if a callback ends the training
     """
-    called = [each for each in _each(callbacks) if not isinstance(each, but)]
+    called = [each for each in _flattened(callbacks) if not isinstance(each, but)]
     # Call all of them, as in SB3, also after one has returned False.
     if not all([callback.on_step() for callback in called]):
         raise _StoppedError
@@ -206,7 +208,7 @@ def _call(callbacks: Iterable[BaseCallback], *but: type[BaseCallback]) -> None:
 
 @contextmanager
 def _counts_restored(callbacks: Iterable[BaseCallback]) -> Iterator[None]:
-    before = [(callback, callback.n_calls) for callback in _each(callbacks)]
+    before = [(callback, callback.n_calls) for callback in _flattened(callbacks)]
     try:
         yield
     finally:

@@ -19,7 +19,7 @@ from sb3_hds.algos.twin.state import (
     Samples,
     View,
     clipped_adam,
-    for_each,
+    grouped_vmap,
     longest_episode,
     resets,
 )
@@ -240,7 +240,7 @@ def learn_from_plans(
         gradient before it is clipped
     """
     learning = [partial(each, config, state, hyper) for each in regressions(config)]
-    of_policy, *of_value = side_by_side(learning)
+    of_policy, *of_value = run_in_parallel(learning)
     actor, average, optimizer, loss, norm, n_epochs, key = of_policy
     nets = state.networks._replace(actor=actor, average=average)
     progress = state.progress._replace(actor_optimizer=optimizer, n_epochs=n_epochs, key=key)
@@ -257,7 +257,7 @@ def regressions(config: EpochConfig) -> list[Callable[..., Any]]:
     return [learn_policy, *([learn_value] if config.terminal_value else [])]
 
 
-def side_by_side(works: Sequence[Callable[[], Any]]) -> list[Any]:
+def run_in_parallel(works: Sequence[Callable[[], Any]]) -> list[Any]:
     """
     :param works: functions without side effects; the first one runs in this thread
     :return: their results
@@ -325,7 +325,7 @@ def keep_better(
     nets, progress = state.networks, state.progress
     pairs = ((nets.average, nets.inside), (nets.acting, nets.acting_inside))
     going = [partial(mean_return, config, hyper, progress.key, *pair) for pair in pairs]
-    (of_average, key), (of_acting, _) = side_by_side(going)
+    (of_average, key), (of_acting, _) = run_in_parallel(going)
     returns = np.array([float(of_average), float(of_acting)], np.float32)
     acting, inside = pairs[0] if returns[0] > returns[1] else pairs[1]
     return state._replace(
@@ -356,7 +356,7 @@ def mean_return(
     varied = jax.tree.map(lambda leaf: leaf[rollouts], hyper.varied)
     policy = lambda obs: output(config.actor, actor, inside(hyper.view(obs)))  # noqa: E731
     value = lambda s, own: follow(problem.with_params(own), s, policy, length).value  # noqa: E731
-    return jnp.mean(for_each(value, starts, varied)), jax.random.key_data(after)
+    return jnp.mean(grouped_vmap(value, starts, varied)), jax.random.key_data(after)
 
 
 def _n_starts(twin: Twin) -> int:

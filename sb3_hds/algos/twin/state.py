@@ -20,7 +20,7 @@ from sb3_hds.planning import Plan, Problem, best_of_random
 _TYPICAL_SHORTFALL = 12.0
 # Limit of the effective horizon 1 / (1 - discount) in the scale of rewards [steps].
 _LONGEST = 1000.0
-# Rows that are vectorised together, see `for_each`.
+# Rows that are vectorised together, see `grouped_vmap`.
 _GROUP = 16
 # Episode length of twins that declare none [steps].
 _LONG_EPISODE = 1000
@@ -269,7 +269,7 @@ def resets(twin: Twin, params: Params, key: PRNGKeyArray, n: int) -> State:
     return jax.vmap(lambda k: twin.initial(k, params))(jax.random.split(key, n))
 
 
-def for_each(function: Callable, *rows: Any) -> Any:
+def grouped_vmap(function: Callable, *rows: Any) -> Any:
     """
     ``jax.vmap`` over two axes instead of one: on a CPU, XLA multiplies thin matrices, the main cost
     of rolling out a policy, twice as fast with a batch dimension.
@@ -290,7 +290,7 @@ def longest_episode(twin: Twin) -> int:
     return twin.max_episode_steps or _LONG_EPISODE
 
 
-def problem_of(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Problem:
+def planning_problem(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Problem:
     """:return: the planning problem with the current networks"""
 
     def roots(obs: Obs) -> jax.Array:

@@ -82,25 +82,25 @@ class SoftActorCritic(ModelFreeAlgorithm):
 
     config_class = SACConfig
     #: the algorithm's defaults for arguments of the policy
-    usual_policy_kwargs: ClassVar[Mapping[str, Any]] = {}
+    default_policy_kwargs: ClassVar[Mapping[str, Any]] = {}
 
     @takes(SACConfig)
     def __init__(self, config: SACConfig) -> None:
         self.construct(config)
 
     def construct(self, config: SACConfig, **more: Any) -> None:  # type: ignore[override]
-        policy_kwargs = {**self.usual_policy_kwargs, **(config.policy_kwargs or {})}
+        policy_kwargs = {**self.default_policy_kwargs, **(config.policy_kwargs or {})}
         super().construct(dataclasses.replace(config, policy_kwargs=policy_kwargs), **more)
 
     def update_config(self) -> UpdateConfig:
         """
         Config of the update: that of SAC for the networks of the policy
-        (``GaussianPolicy.plain_update_config``) with the arguments of this algorithm. Subclasses
+        (``GaussianPolicy.sac_update_config``) with the arguments of this algorithm. Subclasses
         replace parts of it.
         """
         config = self.config
         return dataclasses.replace(
-            self.policy.plain_update_config(),
+            self.policy.sac_update_config(),
             policy_delay=config.policy_delay,
             target_update_interval=config.target_update_interval,
             learns_ent_coef=isinstance(config.ent_coef, str),
@@ -160,7 +160,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
                 policy.update_config, policy.agent_state, batches, now, hyper, found
             )
             report = {name: float(x) for name, x in jax.device_get(found)._asdict().items()}
-            self._take(state, report)
+            self._accept(state, report)
         return report
 
     def hyper(self) -> Hyperparams:
@@ -182,7 +182,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
     def stored(
         self, new_obs: np.ndarray | dict[str, np.ndarray], reward: np.ndarray, dones: np.ndarray
     ) -> None:
-        self.policy.observed(new_obs)
+        self.policy.update_obs_stats(new_obs)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

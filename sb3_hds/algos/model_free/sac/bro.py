@@ -58,8 +58,8 @@ class BroPolicyConfig(GaussianPolicyConfig):
     net_arch: Sequence[int] | Mapping[str, Sequence[int]] = dataclasses.field(
         default_factory=lambda: {"pi": (256,), "qf": (512, 512)}
     )
-    usual_optimizer = ("adamw", {"weight_decay": 1e-4})
-    squashes = True
+    default_optimizer = ("adamw", {"weight_decay": 1e-4})
+    default_squash_log_std = True
     unused = ("renorm_warmup_steps", "dropout_rate", "ortho_init")
 
 
@@ -141,7 +141,7 @@ class BRO(SoftActorCritic):
     kept_by_restarts = ("obs_stats", "n_updates")
 
     config_class = BROConfig
-    usual_policy_kwargs = {"n_quantiles": 100}
+    default_policy_kwargs = {"n_quantiles": 100}
 
     @takes(BROConfig)
     def __init__(self, config: BROConfig) -> None:

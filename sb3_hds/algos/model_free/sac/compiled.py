@@ -68,7 +68,7 @@ def learn_compiled(
     :param model: hyperparameters and environment, not changed: any algorithm of the SAC family
         whose environment has a twin; BRO resets its networks after 15,000 steps and is refused for
         more, unless it is made with ``param_resets=[]``
-    :param total_timesteps: of each seed, rounded up to whole rounds of ``train_freq``
+    :param total_timesteps: of each seed, rounded up to full rounds of ``train_freq``
     :param seeds: of the initial networks, as in the constructor, and of the training
     :param progress_bar: whether to show a progress bar
     :param twin: stepped instead of the twin that belongs to the environment with its wrappers
@@ -95,29 +95,29 @@ def learn_compiled(
     else:
         check_mirrors(env, twin)
     loop = _loop_of(models[0], total_timesteps, twin)
-    runs, done = _begun(loop, models, seeds), []
-    lost = np.zeros(len(seeds), bool)
+    runs, done = _initial_runs(loop, models, seeds), []
+    diverged = np.zeros(len(seeds), bool)
     try:
-        for rounds in _calls(model, loop, total_timesteps, progress_bar):
+        for rounds in _rounds_of_calls(model, loop, total_timesteps, progress_bar):
             runs, now, report = run_rounds(loop, loop.twin.params, runs, rounds)
             done.append((now, rounds))
-            lost |= _diverged(report)
-            if lost.all():
+            diverged |= _diverged(report)
+            if diverged.all():
                 break
     except KeyboardInterrupt:
-        n_done = _n_steps([_that_happened(*call) for call in done])
+        n_done = _n_steps([_without_padding(*call) for call in done])
         warnings.warn(f"Interrupted after {n_done} of {total_timesteps} steps.")
-    steps = [_that_happened(*call) for call in done]
-    whole = jax.device_get(runs._replace(key=jax.random.key_data(runs.key)))
-    kept = np.flatnonzero(~lost).tolist()
+    steps = [_without_padding(*call) for call in done]
+    on_host = jax.device_get(runs._replace(key=jax.random.key_data(runs.key)))
+    kept = np.flatnonzero(~diverged).tolist()
     for i in kept:
-        _take_over(models[i], _of_seed(runs, i), _of_seed(whole, i), _n_steps(steps))
+        _continue_from(models[i], _of_seed(runs, i), _of_seed(on_host, i), _n_steps(steps))
     episodes = [_episodes(steps, i) for i in range(len(seeds))]
-    if lost.any():
+    if diverged.any():
         raise SeedsDivergedError(
-            f"Learning diverged with the seeds {[seeds[i] for i in np.flatnonzero(lost)]}. Lower "
-            "the learning rate, or scale rewards. The models and episodes of the other seeds are "
-            "attributes of this error.",
+            f"Learning diverged with the seeds {[seeds[i] for i in np.flatnonzero(diverged)]}. "
+            "Lower the learning rate, or scale rewards. The models and episodes of the other seeds "
+            "are attributes of this error.",
             {seeds[i]: models[i] for i in kept},
             {seeds[i]: episodes[i] for i in kept},
         )
@@ -213,7 +213,7 @@ def _loop_of(model: SoftActorCritic, total_timesteps: int, twin: Twin) -> Loop:
     )
 
 
-def _begun(loop: Loop, models: Sequence[SoftActorCritic], seeds: Sequence[int]) -> Run:
+def _initial_runs(loop: Loop, models: Sequence[SoftActorCritic], seeds: Sequence[int]) -> Run:
     """Initial runs; the random numbers of a seed do not depend on the other seeds."""
     singles = []
     for model, seed in zip(models, seeds, strict=True):
@@ -227,7 +227,7 @@ def _begun(loop: Loop, models: Sequence[SoftActorCritic], seeds: Sequence[int]) 
     return jax.device_put(stacked._replace(agent=state), device)
 
 
-def _calls(
+def _rounds_of_calls(
     model: SoftActorCritic, loop: Loop, total_timesteps: int, progress_bar: bool
 ) -> Iterable[Round]:
     """The rounds of each call of the program, with the hyperparameters of their schedules."""
@@ -236,7 +236,7 @@ def _calls(
     table = np.array([_hyper_at(model, 1.0 - begin / total) for begin in begins], np.float32)
     per_call = max(1, _STEPS_PER_CALL // loop.train_freq)
     calls = [
-        _filled_up(begins[at : at + per_call], table[at : at + per_call], per_call)
+        _padded(begins[at : at + per_call], table[at : at + per_call], per_call)
         for at in range(0, len(begins), per_call)
     ]
     return track(calls, "learning", disable=not progress_bar)
@@ -249,15 +249,15 @@ def _hyper_at(model: SoftActorCritic, remaining: float) -> Hyperparams:
     return hyper
 
 
-def _filled_up(begins: np.ndarray, table: np.ndarray, n: int) -> Round:
+def _padded(begins: np.ndarray, table: np.ndarray, n: int) -> Round:
     more = n - len(begins)
-    happens = np.arange(n) < len(begins)
+    active = np.arange(n) < len(begins)
     begins, table = np.pad(begins, (0, more)), np.pad(table, ((0, more), (0, 0)))
     columns: Any = jnp.asarray(table).T
-    return Round(jnp.asarray(begins, jnp.int32), jnp.asarray(happens), Hyperparams(*columns))
+    return Round(jnp.asarray(begins, jnp.int32), jnp.asarray(active), Hyperparams(*columns))
 
 
-def _take_over(model: SoftActorCritic, run: Run, on_host: Run, n_steps: int) -> None:
+def _continue_from(model: SoftActorCritic, run: Run, on_host: Run, n_steps: int) -> None:
     """Continue the model from the end of the run."""
     key = jax.random.key(int(on_host.key[-1]), impl=GENERATOR)
     device = next(iter(model.policy.agent_state.key.devices()))
@@ -296,8 +296,8 @@ def _episodes(steps: Sequence[Step], i: int) -> Episodes:
     return Episodes(1 + np.flatnonzero(ended), totals[ended])
 
 
-def _that_happened(steps: Step, rounds: Round) -> Step:
-    n = int(rounds.happens.sum())
+def _without_padding(steps: Step, rounds: Round) -> Step:
+    n = int(rounds.active.sum())
     return jax.tree.map(lambda x: np.asarray(x)[:, :n], steps)
 
 

@@ -95,12 +95,12 @@ class Round(NamedTuple):
     Steps of the environment, then updates.
 
     :param steps: steps of the environment before the round
-    :param happens: False for padding, which makes all calls of the program equally long
+    :param active: False for padding, which makes all calls of the program equally long
     :param hyper: hyperparameters of the round
     """
 
     steps: Int[Array, ""]
-    happens: Bool[Array, ""]
+    active: Bool[Array, ""]
     hyper: Hyperparams
 
 
@@ -160,15 +160,15 @@ def runs_axes() -> Run:
 def _round(
     loop: Loop, params: Params, carry: tuple[Run, UpdateMetrics], now: Round
 ) -> tuple[tuple[Run, UpdateMetrics], Step]:
-    def happen() -> tuple[tuple[Run, UpdateMetrics], Step]:
+    def run_round() -> tuple[tuple[Run, UpdateMetrics], Step]:
         run, steps = jax.lax.scan(partial(_step, loop, params, now.steps), carry[0], counts)
         after = now.steps + loop.train_freq
         learn = lambda: _learn(loop, run, now.hyper, carry[1], after)  # noqa: E731
         return jax.lax.cond(after > loop.learning_starts, learn, lambda: (run, carry[1])), steps
 
     counts = jnp.arange(loop.train_freq)
-    nothing = Step(jnp.zeros(loop.train_freq, bool), jnp.zeros(loop.train_freq))
-    return jax.lax.cond(now.happens, happen, lambda: (carry, nothing))
+    padding = Step(jnp.zeros(loop.train_freq, bool), jnp.zeros(loop.train_freq))
+    return jax.lax.cond(now.active, run_round, lambda: (carry, padding))
 
 
 def _step(loop: Loop, params: Params, before: Array, run: Run, count: Array) -> tuple[Run, Step]:
@@ -190,7 +190,7 @@ def _step(loop: Loop, params: Params, before: Array, run: Run, count: Array) -> 
     memory = jax.tree.map(lambda rows, new: rows.at[at].set(new), run.memory, row)
     agent = run.agent
     if loop.update_config.normalize_observations:
-        agent = agent._replace(obs_stats=_with_one_more(agent.obs_stats, obs))
+        agent = agent._replace(obs_stats=_updated_stats(agent.obs_stats, obs))
     fresh = twin.initial(start_key, params)
     start = fresh, twin.observe(fresh, params)
     state, obs = jax.tree.map(partial(jnp.where, ended), start, (state, obs))
@@ -257,7 +257,7 @@ def _std_of(loop: Loop, agent: SACState) -> Array:
     return noise_std(actor, dict(agent.actor.weights))
 
 
-def _with_one_more(stats: RunningStats, obs: Array) -> RunningStats:
+def _updated_stats(stats: RunningStats, obs: Array) -> RunningStats:
     """Welford's update, in single precision."""
     count = stats.count + 1.0
     away = obs - stats.mean

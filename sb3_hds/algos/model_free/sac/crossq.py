@@ -26,7 +26,7 @@ class CrossQPolicyConfig(GaussianPolicyConfig):
         default_factory=lambda: {"pi": (256, 256), "qf": (512, 512)}
     )
     renorm_warmup_steps: int | None = 100_000
-    usual_optimizer = ("adam", {"b1": 0.5})
+    default_optimizer = ("adam", {"b1": 0.5})
 
 
 class CrossQPolicy(GaussianPolicy):

@@ -33,7 +33,7 @@ class DroQ(SoftActorCritic):
     """
 
     config_class = DroQConfig
-    usual_policy_kwargs = {"dropout_rate": 0.01, "layer_norm": True}
+    default_policy_kwargs = {"dropout_rate": 0.01, "layer_norm": True}
 
     @takes(DroQConfig)
     def __init__(self, config: DroQConfig) -> None:

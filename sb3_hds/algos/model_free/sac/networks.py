@@ -26,7 +26,7 @@ _CLIPPED, _SQUASHED = (-20.0, 2.0), (-10.0, 2.0)
 # Limits of BatchRenorm (Ioffe 2017, section 3), and the floor of the variance in SBX's CrossQ.
 _R_MAX, _D_MAX, _RENORM_EPSILON = 3.0, 5.0, 1e-3
 #: flax's default initialiser of kernels
-USUAL = nn.initializers.lecun_normal()
+LECUN_NORMAL = nn.initializers.lecun_normal()
 
 
 def product(x: Float[Array, "*batch n"], kernel: Float[Array, "n m"]) -> Float[Array, "*batch m"]:
@@ -118,7 +118,7 @@ class Mlp(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
-        kernels = ORTHOGONAL if self.ortho_init else USUAL
+        kernels = ORTHOGONAL if self.ortho_init else LECUN_NORMAL
         if self.renorm_warmup_steps is not None:
             x = BatchRenorm(self.renorm_warmup_steps, self.momentum)(x, train)
         for width in self.net_arch:
@@ -261,8 +261,8 @@ class GaussianActor(nn.Module):
     body: nn.Module
     n_act: int
     squash_log_std: bool = False
-    of_mean: nn.initializers.Initializer = USUAL
-    of_std: nn.initializers.Initializer = USUAL
+    of_mean: nn.initializers.Initializer = LECUN_NORMAL
+    of_std: nn.initializers.Initializer = LECUN_NORMAL
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
@@ -296,7 +296,7 @@ class ExploringActor(nn.Module):
     full_std: bool
     use_expln: bool
     clip_mean: float
-    of_mean: nn.initializers.Initializer = USUAL
+    of_mean: nn.initializers.Initializer = LECUN_NORMAL
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch obs"], train: bool = False) -> Gaussian:
@@ -321,7 +321,7 @@ class Critic(nn.Module):
 
     body: nn.Module
     n_values: int = 1
-    of_values: nn.initializers.Initializer = USUAL
+    of_values: nn.initializers.Initializer = LECUN_NORMAL
 
     @nn.compact
     def __call__(

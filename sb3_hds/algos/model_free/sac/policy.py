@@ -93,9 +93,9 @@ class GaussianPolicyConfig(PolicyConfig):
     optimizer_kwargs: Mapping[str, Any] | None = None
     qf_optimizer_kwargs: Mapping[str, Any] | None = None
     #: default optimiser and its arguments
-    usual_optimizer: ClassVar[tuple[str, Mapping[str, Any]]] = ("adam", {})
+    default_optimizer: ClassVar[tuple[str, Mapping[str, Any]]] = ("adam", {})
     #: default of ``squash_log_std``
-    squashes: ClassVar[bool] = False
+    default_squash_log_std: ClassVar[bool] = False
     #: arguments that these networks do not have
     unused: ClassVar[tuple[str, ...]] = ()
 
@@ -147,7 +147,7 @@ class GaussianPolicyConfig(PolicyConfig):
 
     def optimizers(self) -> tuple[Optimizer, Optimizer]:
         """:return: of the actor and of the critics"""
-        make, usual = self.usual_optimizer
+        make, usual = self.default_optimizer
         if self.optimizer_class is not None:
             make, usual = self.optimizer_class, {}
         own = {**usual, **(self.optimizer_kwargs or {})}
@@ -160,7 +160,7 @@ class GaussianPolicy(LearningPolicy):
     ``"MlpPolicy"`` and ``"MultiInputPolicy"``: dense layers, for every algorithm of the family.
     """
 
-    held = ("target", "obs_stats")
+    saved_with_weights = ("target", "obs_stats")
 
     @takes(GaussianPolicyConfig)
     def __init__(self, config: GaussianPolicyConfig) -> None:
@@ -180,11 +180,11 @@ class GaussianPolicy(LearningPolicy):
             self.actor_network = networks.ExploringActor(body, self.n_act, *gsde, of_mean)
         else:
             given = config.squash_log_std
-            squash = config.squashes if given is None else bool(given)
+            squash = config.default_squash_log_std if given is None else bool(given)
             self.actor_network = networks.GaussianActor(body, self.n_act, squash, of_mean, of_std)
         self.critic_network = networks.Critic(self.critic_body(qf), config.n_quantiles, of_mean)
         self.optimizers = config.optimizers()
-        self.forget_noise()
+        self.discard_noise()
         self._noise = np.random.default_rng(0)
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
@@ -205,14 +205,14 @@ class GaussianPolicy(LearningPolicy):
     def last_layers(self) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
         """:return: initialisers of the layers of means and values, and of that of ``log_std``"""
         if self.config.ortho_init in (False, "hidden"):
-            return networks.USUAL, networks.USUAL
+            return networks.LECUN_NORMAL, networks.LECUN_NORMAL
         return networks.ORTHOGONAL, networks.ORTHONORMAL
 
-    def build_plain(self) -> None:
+    def build_default(self) -> None:
         """Initialise networks for SAC's update, or CrossQ's with batch normalisation."""
-        self.build(self.plain_update_config(), 1.0, 0, jax.devices()[0])
+        self.build(self.sac_update_config(), 1.0, 0, jax.devices()[0])
 
-    def plain_update_config(self) -> UpdateConfig:
+    def sac_update_config(self) -> UpdateConfig:
         """:return: SAC's update with these networks, or CrossQ's with batch normalisation"""
         return UpdateConfig(
             actor=self.actor_network,
@@ -241,7 +241,7 @@ class GaussianPolicy(LearningPolicy):
         )
         self._draw_noise_by(seed)
 
-    def observed(self, obs: np.ndarray | dict[str, np.ndarray]) -> None:
+    def update_obs_stats(self, obs: np.ndarray | dict[str, np.ndarray]) -> None:
         """Add observations of one step of every environment to the running statistics."""
         if self.normalize_observations:
             stats = self.agent_state.obs_stats.with_more(self.flatten(obs))
@@ -283,9 +283,9 @@ class GaussianPolicy(LearningPolicy):
 
     def _draw_noise_by(self, seed: int) -> None:
         self._noise = np.random.default_rng(seed)
-        self.forget_noise()
+        self.discard_noise()
 
-    def forget_noise(self) -> None:
+    def discard_noise(self) -> None:
         self.matrices: Any = None
         self._lasting, self._age = self.matrices, 0
 
@@ -331,7 +331,7 @@ class SimbaPolicyConfig(GaussianPolicyConfig):
         default_factory=lambda: {"pi": (128,), "qf": (128, 128)}
     )
     normalize_observations: bool = True
-    usual_optimizer = ("adamw", {"weight_decay": 1e-2})
+    default_optimizer = ("adamw", {"weight_decay": 1e-2})
     unused = ("renorm_warmup_steps", "ortho_init")
 
 

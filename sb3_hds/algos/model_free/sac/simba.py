@@ -18,7 +18,7 @@ from sb3_hds.algos.model_free.sac.update import UpdateConfig, mean_q, mean_value
 class SimbaSACPolicyConfig(SimbaPolicyConfig):
     """Arguments of ``SimbaSACPolicy``, which squashes ``log_std`` unless it explores by gSDE."""
 
-    squashes = True
+    default_squash_log_std = True
 
 
 class SimbaSACPolicy(SimbaPolicy):

@@ -45,7 +45,7 @@ class TQC(SoftActorCritic):
     """
 
     config_class = TQCConfig
-    usual_policy_kwargs = {"n_quantiles": 25}
+    default_policy_kwargs = {"n_quantiles": 25}
 
     @takes(TQCConfig)
     def __init__(self, config: TQCConfig) -> None:

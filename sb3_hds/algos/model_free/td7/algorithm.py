@@ -166,7 +166,7 @@ class TD7(ModelFreeAlgorithm):
             why = "with checkpoints, there are as many updates as steps (use_checkpoints=False)"
             self.warn_of_unused(config, "gradient_steps", why=why)
 
-    def _usual_buffer(self) -> type[ReplayBuffer] | None:
+    def _default_buffer(self) -> type[ReplayBuffer] | None:
         is_dict = isinstance(self.observation_space, spaces.Dict)
         plain = self.n_steps == 1 and not self.optimize_memory_usage and not is_dict
         return LapReplayBuffer if plain else None
@@ -236,7 +236,7 @@ class TD7(ModelFreeAlgorithm):
         :raises DivergedError: if an update diverged; the model keeps its last finite state
         """
         if self.assesses:
-            gradient_steps = self._assessed()
+            gradient_steps = self._assess()
         elif gradient_steps > 0:
             self._forget_assessments()
         if gradient_steps > 0:
@@ -252,7 +252,7 @@ class TD7(ModelFreeAlgorithm):
     def _begin_assessment(self) -> None:
         self.assessed_episodes, self.assessed_steps, self.worst_return = 0, 0, np.inf
 
-    def _assessed(self) -> int:
+    def _assess(self) -> int:
         """
         Assess the policy by its episodes since the last update.
 
@@ -284,13 +284,13 @@ class TD7(ModelFreeAlgorithm):
         rates, policy = self.learning_rates(), self.policy
         metrics, found = {}, zero_metrics(UpdateMetrics)
         for _ in range(n):
-            batch, drawn = self._drawn(batch_size)
+            batch, drawn = self._sample_batch(batch_size)
             state, found, priorities = update(
                 policy.update_config, policy.agent_state, batch, *rates, found
             )
             found = jax.device_get(found)  # NumPy, as before the first update: compiles once
             metrics = {name: float(value) for name, value in found._asdict().items()}
-            self._take(state, metrics)
+            self._accept(state, metrics)
             if drawn is None:
                 continue
             buffer.set_priorities(*drawn, np.asarray(priorities))
@@ -298,7 +298,7 @@ class TD7(ModelFreeAlgorithm):
                 buffer.forget_highest()
         return metrics
 
-    def _drawn(self, batch_size: int) -> tuple[Batch, tuple[np.ndarray, np.ndarray] | None]:
+    def _sample_batch(self, batch_size: int) -> tuple[Batch, tuple[np.ndarray, np.ndarray] | None]:
         """:return: a batch, and with priorities the indices of its transitions"""
         if not self.prioritised:
             return Batch(

@@ -67,7 +67,7 @@ class TD7Policy(LearningPolicy):
     checkpoint, if there is one.
     """
 
-    held = ("copies", "checkpoint")
+    saved_with_weights = ("copies", "checkpoint")
     state: TD7State
 
     @takes(TD7PolicyConfig)
@@ -86,7 +86,7 @@ class TD7Policy(LearningPolicy):
             "qf_optimizer": optimizer,
         }
 
-    def build_plain(self) -> None:
+    def build_default(self) -> None:
         """Initialise networks for the paper's update."""
         self.build(UpdateConfig(**self.parts), 0, jax.devices()[0])
 

@@ -135,8 +135,8 @@ def init_state(config: UpdateConfig, n_obs: int, n_act: int, key: PRNGKeyArray) 
 
 def act(config: UpdateConfig, encoder: Weights, actor: Weights, obs: Array) -> Array:
     """:return: actions in [-1, 1] with these weights"""
-    nothing = jnp.zeros((*obs.shape[:-1], cast(Any, config.actor).n_act))
-    zs, _ = cast(tuple[Array, Array], config.encoder.apply(encoder, obs, nothing))
+    no_action = jnp.zeros((*obs.shape[:-1], cast(Any, config.actor).n_act))
+    zs, _ = cast(tuple[Array, Array], config.encoder.apply(encoder, obs, no_action))
     return cast(Array, config.actor.apply(actor, obs, zs))
 
 

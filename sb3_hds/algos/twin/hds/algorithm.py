@@ -25,7 +25,7 @@ from sb3_hds.algos.twin.hds.correction import (
 )
 from sb3_hds.algos.twin.hds.recorded_steps import RecordedSteps, Source, data_from
 from sb3_hds.algos.twin.model import missing_effects, nulls_of, required
-from sb3_hds.algos.twin.pretraining import meanwhile, nothing
+from sb3_hds.algos.twin.pretraining import no_poll, run_in_threads
 from sb3_hds.core import Effect, Params, Trajectories, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ALL, KNOWN, SignFlip, effect_named, force_of, reversed_joint
@@ -220,7 +220,7 @@ class HDS(TwinAlgorithm):
             n_new=self.real_timesteps - self._refitted_at,
             change=None if n_counted is None else ChangePoint(n_counted, self._changed_in),
         )
-        found = by_data() if self.poll is nothing else meanwhile([by_data], self.poll)[0]
+        found = by_data() if self.poll is no_poll else run_in_threads([by_data], self.poll)[0]
         if found.change is not None:
             self._changed_at = self.real_timesteps - found.change.n_steps
             self._changed_in, self._steps_at_force = found.change.recording, 0
@@ -328,7 +328,7 @@ class HDS(TwinAlgorithm):
             suspected=config.suspected if config.calibrated == "all" else (),
         )
 
-    def _prepared(self, twin: Twin) -> Twin:
+    def _prepare_twin(self, twin: Twin) -> Twin:
         config = self.config
         for name in config.suspected:
             effect_named(name, KNOWN)  # raises if it is unknown

@@ -340,19 +340,19 @@ def _with_residual(
     key = next(iter(shares_of(hybrid)), None)
     if key is None:
         return found, errors
-    whole = windows.errors(hybrid, {**hybrid.params, key: 1.0})
-    found = dataclasses.replace(found, residual=residual, error_hybrid=rms(whole[held]))
+    hybrid_errors = windows.errors(hybrid, {**hybrid.params, key: 1.0})
+    found = dataclasses.replace(found, residual=residual, error_hybrid=rms(hybrid_errors[held]))
     # A force that does not lower the error only costs simulation time.
     if residual is not None and not (residual.accepted or shares_of(twin)):
         return found, errors
-    helps = is_better(whole[held], errors[held])
+    helps = is_better(hybrid_errors[held], errors[held])
     share = 0.0
     if helps:
-        trust = min(1.0, gain(whole[held], errors[held]) / _TRUSTED)
+        trust = min(1.0, gain(hybrid_errors[held], errors[held]) / _TRUSTED)
         share = trust if config.beta == "auto" else float(config.beta)
     twin = hybrid.with_parameters(**{key: 1.0 if helps else 0.0})
     found = dataclasses.replace(found, twin=twin, beta=share)
-    return found, whole if share > 0.0 else errors
+    return found, hybrid_errors if share > 0.0 else errors
 
 
 def names_to_estimate(twin: Twin, wanted: str | Sequence[str] | None) -> tuple[str, ...]:
