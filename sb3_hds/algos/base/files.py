@@ -105,12 +105,12 @@ def name_of(path: Any) -> str:
     return f"'{path}'" if isinstance(path, str | os.PathLike) else "The file"
 
 
-def existing(path: Any, suffix: str = "zip") -> Any:
-    """:return: the path, with the suffix where only that exists; an open file unchanged"""
+def existing(path: Any) -> Any:
+    """:return: the path, with ``.zip`` where it does not exist without; an open file unchanged"""
     if not isinstance(path, str | os.PathLike):
         return path
     named = Path(path)
-    return named if named.exists() else named.with_name(f"{named.name}.{suffix}")
+    return named if named.exists() else named.with_name(f"{named.name}.zip")
 
 
 def _opened(path: Any) -> contextlib.AbstractContextManager[Any]:

@@ -20,9 +20,6 @@ _HORIZON = 0.6
 _SHORTEST, _LONGEST = 12, 32
 # Default lookahead, in horizons.
 _LOOKAHEAD = 5
-# Share of start states with random plans: they cost as much as the policy's own plans, and the
-# policy does not learn a local optimum that half of the rollouts avoid.
-_RANDOM_SHARE = 0.5
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -193,7 +190,6 @@ def epoch_config(config: TwinConfig, policy: TwinPolicy, twin: Twin) -> EpochCon
         n_iterations=how.n_iterations,
         n_step_sizes=how.n_step_sizes,
         n_candidates=config.n_random_plans,
-        random_share=_RANDOM_SHARE,
         discount=config.gamma,
         terminal_value=config.terminal_value,
         shift_ends=config.shift_ends,

@@ -47,6 +47,9 @@ from sb3_hds.planning.problem import Control
 
 # Advantage of plans that start from the policy's own over random ones, in units of the objective.
 _TIE = 1e-3
+# Share of start states with random plans: they cost as much as the policy's own plans, and the
+# policy does not learn a local optimum that half of the rollouts avoid.
+_RANDOM_SHARE = 0.5
 
 
 class Outcome(NamedTuple):
@@ -256,7 +259,7 @@ def _plan(
 
 def _random_slots(config: EpochConfig) -> np.ndarray:
     """:return: indices of the rollouts that also get random plans"""
-    count = round(config.n_rollouts * config.random_share) if config.n_candidates else 0
+    count = round(config.n_rollouts * _RANDOM_SHARE) if config.n_candidates else 0
     return np.linspace(0, config.n_rollouts, count, endpoint=False).astype(int)
 
 

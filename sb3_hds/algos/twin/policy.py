@@ -68,7 +68,6 @@ class TwinPolicy(TensorPolicy):
         self.max_grad_norm = config.max_grad_norm
         self.networks: Networks
         self.progress: Progress
-
         self.build(jax.random.key(0, impl=GENERATOR), jax.devices()[0])
 
     def build(self, key: jax.Array, device: Any) -> None:

@@ -44,7 +44,6 @@ class EpochConfig:
     n_iterations: int
     n_step_sizes: int
     n_candidates: int
-    random_share: float
     discount: float
     terminal_value: bool
     shift_ends: bool
