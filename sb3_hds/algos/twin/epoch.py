@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.algos.twin.networks import output
+from sb3_hds.algos.twin.policy import output
 from sb3_hds.algos.twin.regression import (
     learn_from_plans,
     regressions,

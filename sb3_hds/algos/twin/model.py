@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_hds import effects, twins
 from sb3_hds.algos.base.construct import in_one_line
 from sb3_hds.algos.base.files import from_state_dict, to_state_dict
-from sb3_hds.algos.twin.state import View
+from sb3_hds.algos.twin.policy import View, unclipped
 from sb3_hds.core import Effect, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.errors import EnvironmentMismatchError, NoTwinError, RewardError
@@ -163,7 +163,7 @@ def view_of(normalise: VecNormalize | None, n_obs: int) -> View:
     :return: its effect on observations of the twin
     """
     if normalise is None or not normalise.norm_obs:
-        return View(jnp.zeros(n_obs), jnp.ones(n_obs), jnp.full((), jnp.inf, jnp.float32))
+        return View(jnp.zeros(n_obs), jnp.ones(n_obs), unclipped())
     statistics: Any = normalise.obs_rms
     scale = np.sqrt(statistics.var + normalise.epsilon)
     return View(

@@ -11,14 +11,19 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from sb3_hds.algos.twin.networks import output, squash, value_of, with_input_scales
+from sb3_hds.algos.twin.policy import (
+    View,
+    clipped_adam,
+    output,
+    squash,
+    value_of,
+    with_input_scales,
+)
 from sb3_hds.algos.twin.state import (
     EpochConfig,
     EpochState,
     Hyperparams,
     Samples,
-    View,
-    clipped_adam,
     grouped_vmap,
     longest_episode,
     resets,

@@ -2,18 +2,26 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
-from sb3_hds.algos.twin.networks import Actor, Value, output, value_of
+from sb3_hds.algos.twin.policy import (
+    Actor,
+    Networks,
+    Progress,
+    Value,
+    View,
+    output,
+    unclipped,
+    value_of,
+)
 from sb3_hds.core import Obs, Params, State, Twin
-from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION, QUICKEST_COMPILATION
+from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION
 from sb3_hds.planning import Plan, Problem, best_of_random
 
 # Typical shortfall of the first rollouts after scaling, in units of the objective.
@@ -56,23 +64,6 @@ class EpochConfig:
     adapt_scales: bool
 
 
-class View(NamedTuple):
-    """
-    An affine map with clipping, as ``VecNormalize`` applies to observations.
-
-    :param mean: shape ``(n_obs,)``
-    :param scale: shape ``(n_obs,)``
-    :param clip: largest absolute value of the result
-    """
-
-    mean: Float[Array, " obs"]
-    scale: Float[Array, " obs"]
-    clip: Any
-
-    def __call__(self, obs: Obs) -> Obs:
-        return jnp.clip((obs - self.mean) / self.scale, -self.clip, self.clip)
-
-
 class Hyperparams(NamedTuple):
     """
     What may change between two epochs without recompiling.
@@ -101,50 +92,6 @@ class Hyperparams(NamedTuple):
     averaging: float
     gradient_steps: int
     view: View
-
-
-class Networks(NamedTuple):
-    """
-    Learned networks, saved with a model.
-
-    :param actor: parameters of the policy in training
-    :param average: moving average of ``actor``
-    :param value: parameters of the value network
-    :param inside: the networks' own normalisation of their input
-    :param acting: parameters of the policy that acts: the best average in comparisons so far
-    :param acting_inside: normalisation of the input of ``acting``
-    """
-
-    actor: Mapping[str, Any]
-    average: Mapping[str, Any]
-    value: Mapping[str, Any]
-    inside: View
-    acting: Mapping[str, Any]
-    acting_inside: View
-
-
-class Progress(NamedTuple):
-    """
-    Training state besides the networks, saved with a model.
-
-    :param actor_optimizer: state of Adam
-    :param value_optimizer: state of Adam
-    :param reward_scale: factor from rewards to the objective
-    :param reward_offset: reward that counts as zero
-    :param control_scale: geometric mean of the size of the plans' controls, shape ``(n_act,)``
-    :param gain: mean gain of the last epoch's plans, in units of the objective
-    :param n_epochs: number of epochs so far
-    :param key: random key, as integers
-    """
-
-    actor_optimizer: Any
-    value_optimizer: Any
-    reward_scale: jax.Array
-    reward_offset: jax.Array
-    control_scale: jax.Array
-    gain: jax.Array
-    n_epochs: jax.Array
-    key: jax.Array
 
 
 class Samples(NamedTuple):
@@ -204,30 +151,6 @@ class EpochState(NamedTuple):
     workspace: Workspace
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3), compiler_options=QUICKEST_COMPILATION)
-def fresh_networks(
-    actor: Actor, value: Value, n_obs: int, max_grad_norm: float, key: PRNGKeyArray
-) -> tuple[Networks, Progress]:
-    """:return: networks and training state before the first epoch, with scales of one"""
-    k_actor, k_value, k_next = jax.random.split(key, 3)
-    obs = jnp.zeros(n_obs)
-    weights, value_weights = actor.init(k_actor, obs), value.init(k_value, obs)
-    inside = View(jnp.zeros(n_obs), jnp.ones(n_obs), _unclipped())
-    adam = clipped_adam(max_grad_norm)
-    zero = jnp.zeros(())
-    progress = Progress(
-        adam.init(weights),
-        adam.init(value_weights),
-        jnp.ones(()),
-        zero,
-        jnp.ones(actor.n_act),
-        zero,
-        jnp.zeros((), jnp.int32),
-        jax.random.key_data(k_next),
-    )
-    return Networks(weights, weights, value_weights, inside, weights, inside), progress
-
-
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
 def init_workspace(
     config: EpochConfig, params: Params, view: View, progress: Progress
@@ -256,11 +179,6 @@ def init_workspace(
     scale = _TYPICAL_SHORTFALL / jnp.maximum(shortfall, 1e-6)
     scales = Scales(_input_scales(seen, plans), scale, offset)
     return workspace, scales, progress._replace(key=jax.random.key_data(key))
-
-
-def clipped_adam(max_grad_norm: float) -> optax.GradientTransformation:
-    """Adam with clipped gradients, without its learning rate, which is a hyperparameter."""
-    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam(0.9, 0.99))
 
 
 def resets(twin: Twin, params: Params, key: PRNGKeyArray, n: int) -> State:
@@ -312,18 +230,13 @@ def planning_problem(config: EpochConfig, state: EpochState, hyper: Hyperparams)
     )
 
 
-def _unclipped() -> jax.Array:
-    """Infinity with an explicit dtype: with a weak one, a loaded model would compile again."""
-    return jnp.full((), jnp.inf, jnp.float32)
-
-
 def _input_scales(seen: jax.Array, plans: Plan) -> View:
     lived = plans.alive[..., None] & jnp.isfinite(seen)
     count = jnp.maximum(jnp.sum(lived, (0, 1)), 1)
     mean = jnp.sum(jnp.where(lived, seen, 0.0), (0, 1)) / count
     variance = jnp.sum(jnp.where(lived, (seen - mean) ** 2, 0.0), (0, 1)) / count
     scale = jnp.sqrt(variance)
-    return View(mean, jnp.where(scale > 1e-6, scale, 1.0), _unclipped())
+    return View(mean, jnp.where(scale > 1e-6, scale, 1.0), unclipped())
 
 
 def _best_reward(plans: Plan) -> jax.Array:
