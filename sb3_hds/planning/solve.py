@@ -13,6 +13,8 @@ from sb3_hds.planning.ilqr import gauss_newton, ilqr
 from sb3_hds.planning.line_search import gradient_ascent
 from sb3_hds.planning.problem import Controls, Plan, Problem, TerminalValue, assemble, simulate
 
+# Knots of random sequences.
+_KNOTS = 5
 METHODS: Mapping[str, Callable[..., Plan]] = {
     "first_order": gradient_ascent,
     "gauss_newton": gauss_newton,
@@ -74,9 +76,6 @@ def _solve(settings, params, starts, controls, temperature, keys) -> Plan:
     improve = partial(METHODS[method], problem, n_iterations=n_iterations, temperature=temperature)
     one = lambda start, u, key: improve(start, u, key=key)  # noqa: E731
     return jax.vmap(one, (0, 0, None if keys is None else 0))(starts, controls, keys)
-
-
-_KNOTS = 5
 
 
 def random_controls(key: PRNGKeyArray, horizon: int, n_act: int, scale: float = 2.0) -> Controls:

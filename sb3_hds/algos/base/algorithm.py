@@ -28,7 +28,6 @@ from sb3_hds.algos.base.files import damaged, write_whole
 from sb3_hds.algos.base.policy import TensorPolicy
 from sb3_hds.algos.base.saving import SavesTensors
 from sb3_hds.algos.nets.options import by_names
-from sb3_hds.errors import EnvironmentMismatchError
 
 # Steps per second below which a learner warns and suggests faster settings.
 _SLOW = 5.0
@@ -286,8 +285,8 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
 
         :param path: of a file that ``save_replay_buffer`` wrote; ``.pkl`` may be left out
         :param truncate_last_traj: for ``HerReplayBuffer``: whether to end the last episode
-        :raises ValueError: for a damaged file, and for a buffer of another environment; the model
-            then keeps its buffer
+        :raises ValueError: for a damaged file, for a buffer of another environment, and for one
+            that the algorithm cannot use; the model then keeps its buffer
         """
         before: Any = getattr(self, "replay_buffer", None)
         try:
@@ -300,12 +299,19 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
                 raise
             raise damaged(path, error) from error
         try:
-            check_buffer(self, self.replay_buffer, path)
-        except EnvironmentMismatchError:
+            self.check_replay_buffer(self.replay_buffer, path)
+        except ValueError:
             self.replay_buffer = before
             raise
         # SB3 expects the model's device here; SBX sets the CPU.
         self.replay_buffer.device = self.device  # type: ignore[union-attr]
+
+    def check_replay_buffer(self, buffer: Any, path: Any) -> None:
+        """
+        :param buffer: object that was read from ``path``
+        :raises ValueError: for a buffer that the algorithm cannot use
+        """
+        check_buffer(self, buffer, path)
 
     def _setup_model(self) -> None:
         check_origin(type(self), self.saved_by)

@@ -1,8 +1,6 @@
 """TD7: learned embeddings, prioritised replay, and checkpoints of assessed policies."""
 
 import dataclasses
-import io
-import pathlib
 from dataclasses import KW_ONLY
 from typing import Any, ClassVar
 
@@ -195,26 +193,11 @@ class TD7(ModelFreeAlgorithm):
         noise = getattr(self.action_noise, "base_noise", self.action_noise)
         return excluded if noise is not self._derived_noise else [*excluded, "action_noise"]
 
-    def load_replay_buffer(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        truncate_last_traj: bool = True,
-    ) -> None:
-        """
-        SB3's ``load_replay_buffer``. It unpickles: load only files that you saved yourself.
-
-        :param path: of a file that ``save_replay_buffer`` wrote
-        :param truncate_last_traj: for ``HerReplayBuffer``: as in SB3
-        :raises ValueError: for a buffer without priorities, if transitions are drawn by priority;
-            the model then keeps its buffer
-        """
-        before = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        found = self.replay_buffer
-        if self.prioritised and not isinstance(found, LapReplayBuffer):
-            self.replay_buffer = before
+    def check_replay_buffer(self, buffer: Any, path: Any) -> None:
+        super().check_replay_buffer(buffer, path)
+        if self.prioritised and not isinstance(buffer, LapReplayBuffer):
             raise ValueError(
-                f"'{path}' holds a {type(found).__name__}, which has no priorities to draw by. "
+                f"'{path}' holds a {type(buffer).__name__}, which has no priorities to draw by. "
                 "Load it into TD7(..., replay_buffer_class=ReplayBuffer), which draws uniformly."
             )
 
