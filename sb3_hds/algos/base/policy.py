@@ -111,13 +111,9 @@ class TensorPolicy(BasePolicy):
         """
         check_observation(observation)
         batch, vectorized = self.prepare_obs(observation)
-        actions = np.array(self._predict(batch, deterministic=deterministic))
-        actions = actions.reshape(-1, *self.action_space.shape)  # type: ignore[misc]
-        if self.squash_output:
-            actions = self.unscale_action(np.clip(actions, -1.0, 1.0))
-        else:
-            space: Any = self.action_space
-            actions = np.clip(actions, space.low, space.high)
+        scaled = np.array(self._predict(batch, deterministic=deterministic))
+        scaled = scaled.reshape(-1, *self.action_space.shape)  # type: ignore[misc]
+        actions = self.unscale_action(np.clip(scaled, -1.0, 1.0))
         return actions if vectorized else actions.squeeze(axis=0), state
 
     def prepare_obs(self, observation: Any) -> tuple[Any, bool]:
