@@ -11,9 +11,7 @@ from sb3_hds.algos.base.config import OffPolicyConfig, Rate, between
 from sb3_hds.algos.twin.policy import TwinPolicy
 from sb3_hds.algos.twin.state import EpochConfig
 from sb3_hds.core import Twin
-
-PLANNERS = ("first_order", "gauss_newton", "ilqr")
-LOSSES = ("smooth_absolute", "squared")
+from sb3_hds.planning import METHODS
 
 # Default horizon [s], and its limits [steps].
 _HORIZON = 0.6
@@ -144,7 +142,7 @@ class TwinConfig(OffPolicyConfig):
         self.require_range(0.0, math.inf, "a finite number of at least 0", *non_negative)
         fine = between(self.gamma, 0.0, 1.0) and self.gamma > 0.0
         self.require(fine, "gamma", "a number above 0 and at most 1")
-        self.require_choice("planner", PLANNERS)
+        self.require_choice("planner", list(METHODS))
 
     @property
     def refinements(self) -> Refinements:
@@ -164,7 +162,7 @@ class PODSConfig(Refinements, TwinConfig):
         shares = ("learned_share", "gain_weight", "sensitivity_weight", "averaging")
         self.require_range(0.0, 1.0, "a number from 0 to 1", *shares)
         self.require_range(0.0, math.inf, "a finite number of at least 0", "least_gain")
-        self.require_choice("loss", LOSSES)
+        self.require_choice("loss", ("smooth_absolute", "squared"))
 
     @property
     def refinements(self) -> Refinements:

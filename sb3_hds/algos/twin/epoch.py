@@ -33,16 +33,7 @@ from sb3_hds.algos.twin.state import (
 )
 from sb3_hds.core import Obs, Params, State
 from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION
-from sb3_hds.planning import (
-    Plan,
-    Problem,
-    best_of_random,
-    follow,
-    gauss_newton,
-    gradient_ascent,
-    ilqr,
-    score,
-)
+from sb3_hds.planning import METHODS, Plan, Problem, best_of_random, follow, ilqr, score
 from sb3_hds.planning.problem import Control
 
 # Advantage of plans that start from the policy's own over random ones, in units of the objective.
@@ -288,8 +279,8 @@ def _improve(
         if config.planner == "ilqr":
             plan, gains = ilqr(here, start, first, **options)
             return plan, jnp.sqrt(gains.sensitivity / discounts)
-        improver = gradient_ascent if config.planner == "first_order" else gauss_newton
-        return improver(here, start, first, **options), jnp.ones(config.horizon)
+        plan = METHODS[config.planner](here, start, first, **options)
+        return plan, jnp.ones(config.horizon)
 
     keys = jax.random.split(key, first.value.shape[0]) if config.annealed else None
     return jax.vmap(one, (0, 0, None if keys is None else 0))(first, varied, keys)
