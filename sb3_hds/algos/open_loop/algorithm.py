@@ -296,7 +296,8 @@ class OpenLoop(SavesTensors):
             self.policy.constants = finalists[left[0]]
             self.policy.search = self.policy.search._replace(ranked=np.asarray(True))
             self.logger.record("search/best_whole_episodes", float(np.mean(scores[left[0]])))
-            self._dump(log_interval)
+            if log_interval is not None:
+                self.dump_logs()
             if len(scores[left[0]]) > 1 and len(left) > 2:
                 left = left[: max(2, len(left) // 2)]
 
@@ -308,10 +309,6 @@ class OpenLoop(SavesTensors):
         record("search/best_return_so_far", float(search.elite_returns[0]))
         record("search/sigma", float(search.sigma))
         if log_interval is not None and int(search.generation) % log_interval == 0:
-            self._dump(log_interval)
-
-    def _dump(self, log_interval: int | None) -> None:
-        if log_interval is not None:
             self.dump_logs()
 
     def dump_logs(self) -> None:
