@@ -122,7 +122,8 @@ def backpropagation(model):
 
     import jax
 
-    from sb3_hds.algos.twin.state import clipped_adam, resets
+    from sb3_hds.algos.twin.policy import clipped_adam
+    from sb3_hds.algos.twin.state import resets
     from sb3_hds.planning import Problem, follow
 
     twin, actor = model.twin, model.policy.actor_network

@@ -60,7 +60,7 @@ def policy_of(kind: str):
     make, space, arguments = KINDS[kind]
     policy = make(space, TORQUES, lambda _: 0.0, **arguments)
     if hasattr(policy, "observed"):
-        policy.observed(drawn(space, 50, seed=3))
+        policy.update_obs_stats(drawn(space, 50, seed=3))
     rng = np.random.default_rng(1)
     state = policy.state_dict()
     for name, tensor in state.items():

@@ -64,8 +64,8 @@ def test_updates_are_counted_where_they_are_interrupted(monkeypatch):
             raise KeyboardInterrupt
         return taken(*given)
 
-    taken = model._take
-    monkeypatch.setattr(model, "_take", interrupted)
+    taken = model._accept
+    monkeypatch.setattr(model, "_accept", interrupted)
     before = model._n_updates
     with pytest.raises(KeyboardInterrupt):
         model.train(gradient_steps=200, batch_size=16)

@@ -12,8 +12,13 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_hds.algos import learn_compiled
-from sb3_hds.algos.model_free.sac.update import actor_distribution
-from sb3_hds.algos.nets.heads import Gaussian, exploration_std, log_probability, marginal_std
+from sb3_hds.algos.model_free.sac.networks import (
+    Gaussian,
+    exploration_std,
+    log_probability,
+    marginal_std,
+)
+from sb3_hds.algos.model_free.sac.update import forward
 
 
 def both_noises(full_std: bool, use_expln: bool) -> tuple[Gaussian, np.ndarray, Any]:
@@ -55,7 +60,7 @@ def test_each_environment_has_its_noise_matrix_and_the_deviation_is_logged():
     model.learn(45, log_interval=1)
 
     policy, obs = model.policy, np.ones((3, 3), np.float32)
-    gaussian, _ = actor_distribution(policy.actor_network, policy.agent_state.actor.weights, obs)
+    gaussian, _ = forward(policy.actor_network, policy.agent_state.actor.weights, obs)
     noise = np.stack([gaussian.latent[0] @ matrix for matrix in policy.matrices])
     wanted = 2.0 * np.tanh(gaussian.mean + noise)
     np.testing.assert_allclose(model.predict(obs)[0], wanted, rtol=1e-4, atol=1e-6)
@@ -72,7 +77,7 @@ def test_a_noise_matrix_lasts_over_as_many_collections_as_it_takes(compiled):
 
     buffer, policy = model.replay_buffer, model.policy
     weights, seen = policy.agent_state.actor.weights, buffer.observations[:40, 0]
-    gaussian, _ = actor_distribution(policy.actor_network, weights, seen)
+    gaussian, _ = forward(policy.actor_network, weights, seen)
     apart = np.arctanh(buffer.actions[:40, 0]) - gaussian.mean
 
     def misfit(steps: slice) -> float:
@@ -92,7 +97,7 @@ def test_the_optimistic_actor_of_bro_explores_by_gsde_too():
     moved = jax.tree.map(lambda weight: weight + 0.1, extra["actor"].weights)
     extra = extra | {"actor": extra["actor"]._replace(weights=moved)}
     policy.agent_state = policy.agent_state._replace(extra=extra)
-    gaussian, _ = actor_distribution(recipe.actor, actor, STATES)
+    gaussian, _ = forward(recipe.actor, actor, STATES)
     shift = recipe.extra.network.apply(moved, STATES, gaussian.mean)
     policy.reset_noise()
 

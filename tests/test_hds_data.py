@@ -16,7 +16,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from sb3_hds import HDS, PODS, effects, twins
 from sb3_hds.algos.twin.hds.algorithm import _effects_of, _native_of
 from sb3_hds.algos.twin.hds.correction import Correction, CorrectionConfig, correct
-from sb3_hds.algos.twin.hds.windows import Since
+from sb3_hds.algos.twin.hds.windows import ChangePoint
 from sb3_hds.core import Trajectories
 from sb3_hds.effects import force_of
 from sb3_hds.errors import TrajectoryError
@@ -171,7 +171,7 @@ def test_data_from_before_a_change_are_forgotten():
     found = corrected(twins.make("PendulumReal"), both, n_new=after.n_steps)
     mixed = corrected(twins.make("PendulumReal"), both, n_new=both.n_steps)
 
-    assert found.since is not None and mixed.since is None
+    assert found.change is not None and mixed.change is None
     assert found.error_calibrated < 1e-3 < mixed.error_calibrated
 
 
@@ -352,10 +352,10 @@ def test_a_learned_force_travels_as_tensors():
 def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch, no_planning):
     counted = []
 
-    def changed_once(twin, data, *_, since, **__):
-        counted.append((data.n_steps, since))
+    def changed_once(twin, data, *_, change, **__):
+        counted.append((data.n_steps, change))
         found = Correction(twin, 0.0, changed=True, attached={"friction": 0.0})
-        return dataclasses.replace(found, since=Since(15, 0) if len(counted) == 2 else None)
+        return dataclasses.replace(found, change=ChangePoint(15, 0) if len(counted) == 2 else None)
 
     monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm.correct", changed_once)
     monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm._REPLAN_EPOCHS", 2)
@@ -363,7 +363,7 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch, no_
 
     assert (model.num_timesteps, model.real_timesteps) == (20, 30)
     # Fifteen of the first twenty steps, and the ten that came after.
-    assert counted == [(10, None), (20, None), (30, Since(25, 0))]
+    assert counted == [(10, None), (20, None), (30, ChangePoint(25, 0))]
     # What was believed of effects that were attached is known from then on.
     assert model.nominal["friction"] == 0.0
     # Planning anew is no block of its own.

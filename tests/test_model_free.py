@@ -21,10 +21,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_hds import DroQ
 from sb3_hds.algos.model_free.sac import algorithm as soft_actor_critic
 from sb3_hds.algos.model_free.sac import update as off_policy
+from sb3_hds.algos.model_free.sac.networks import SimbaNet
 from sb3_hds.algos.model_free.td7 import update as td7_update
 from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
 from sb3_hds.algos.model_free.update import batches_of
-from sb3_hds.algos.nets.mlp import SimbaNet
 from sb3_hds.algos.nets.options import TrainState
 from sb3_hds.errors import EnvironmentMismatchError
 
@@ -65,9 +65,9 @@ def test_after_the_same_seed_a_model_explores_and_learns_alike():
 
 @each(
     ("droq", {"policy_kwargs": {"log_std_init": -2.0}}, "log_std_init .* without use_sde"),
-    ("crossq_jax", {"tau": 0.01}, "does not look at tau"),
+    ("crossq_jax", {"tau": 0.01}, "ignores tau"),
     ("droq", {"use_sde": True, "train_freq": 1}, "a new noise matrix at each step"),
-    ("td7", {"gradient_steps": 2, "use_checkpoints": True}, "does not look at gradient_steps"),
+    ("td7", {"gradient_steps": 2, "use_checkpoints": True}, "ignores gradient_steps"),
 )
 def test_arguments_without_effect_cause_a_warning(name, arguments, message):
     with pytest.warns(UserWarning, match=message):

@@ -13,15 +13,15 @@ from gymnasium import spaces
 from small_models import small
 
 from sb3_hds.algos.model_free.sac import update as off_policy
-from sb3_hds.algos.model_free.sac.objectives import (
+from sb3_hds.algos.model_free.sac.networks import Dropout
+from sb3_hds.algos.model_free.sac.tqc import (
     all_targets,
     sorted_by_columns,
     sorted_by_rows,
     target_by_target,
 )
-from sb3_hds.algos.nets.mlp import Dropout
 from sb3_hds.algos.nets.observations import flattener
-from sb3_hds.algos.nets.options import TrainState, optimizer_of
+from sb3_hds.algos.nets.options import optimizer_of
 
 
 def test_every_processor_sorts_and_compares_quantiles_alike():
@@ -85,7 +85,7 @@ def test_a_torch_class_means_what_it_does_in_torch(make, arguments):
     ours = optimizer_of(make, arguments)
 
     with jax.enable_x64(True):
-        trained = TrainState({"params": jnp.asarray(w)}, ours.init(jnp.asarray(w)))
+        trained = ours.train_state({"params": jnp.asarray(w)})
         for slope in slopes:
             trained = ours.apply(jnp.asarray(slope), trained, 0.03)
             theirs.grad = th.tensor(slope)

@@ -14,8 +14,8 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_hds.algos import TwinPolicy
 from sb3_hds.algos.nets.options import ACTIVATIONS, activation
-from sb3_hds.algos.twin import networks as nets
-from sb3_hds.algos.twin.networks import Actor, value_of
+from sb3_hds.algos.twin import policy as nets
+from sb3_hds.algos.twin.policy import Actor, value_of
 
 
 class Scales(NamedTuple):

@@ -22,7 +22,7 @@ from sb3_hds.algos.base.policy_file import space_from_plain, space_to_plain
 def test_a_policy_alone_acts_as_its_model_and_nothing_is_unpickled(name, no_pickle):
     model = small(name, seed=3)
     if name == "simba":
-        model.policy.observed(STATES)
+        model.policy.update_obs_stats(STATES)
 
     policy = sb3_hds.load_policy(saved(model))
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from sb3_hds.algos.twin.networks import Actor, Value
+from sb3_hds.algos.twin.policy import Actor, Value, fresh_networks
 from sb3_hds.algos.twin.regression import rescale
-from sb3_hds.algos.twin.state import EpochState, Samples, fresh_networks
+from sb3_hds.algos.twin.state import EpochState, Samples
 
 
 def learner_after(n_epochs):

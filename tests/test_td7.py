@@ -97,7 +97,7 @@ def test_layers_of_td7_start_as_those_of_torch():
 def judged_by(model: TD7) -> list[tuple[float, int]]:
     """:return: what episodes earned by which policies will be judged, and how long they were"""
     judged: list[tuple[float, int]] = []
-    model._assessed = lambda: judged.extend(model._finished) or 0
+    model._assess = lambda: judged.extend(model._finished) or 0
     return judged
 
 
@@ -206,9 +206,7 @@ def test_a_policy_of_td7_is_kept_only_if_it_did_no_worse():
 
     for earned, kept, best in ((-500.0, False, -300.0), (-100.0, True, -100.0)):
         model._finished = [(earned, 200)]
-        assert (
-            model._assessed() == 200 and (model.policy.agent_state.checkpoint is not begun) == kept
-        )
+        assert model._assess() == 200 and (model.policy.agent_state.checkpoint is not begun) == kept
         assert model.best_worst_return == best
 
 
@@ -217,7 +215,7 @@ def test_td7_assesses_by_more_episodes_once_it_has_gone_beyond_the_mark():
     accounts = []
     for n_updates, earned in ((200, -100.0), (400, -100.0), (600, -50.0)):
         model._n_updates, model._finished = n_updates, [(earned, 200)]
-        accounts.append((model._assessed(), model.best_worst_return))
+        accounts.append((model._assess(), model.best_worst_return))
 
     # As in the authors' code: the update that would be the 401st scales the best assessment.
     assert accounts == [(200, -100.0), (200, -90.0), (0, -90.0)] and model.assessed_episodes == 1

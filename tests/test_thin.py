@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from cases import each
 
-from sb3_hds.algos.nets.mlp import Hidden, Last, hidden_product, product
+from sb3_hds.algos.model_free.sac.networks import Hidden, Last, hidden_product, product
 
 pytestmark = pytest.mark.usefixtures("x64")
 

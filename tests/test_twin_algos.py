@@ -12,11 +12,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import twins
-from sb3_hds.algos.twin import algorithm as twin_algorithm
-from sb3_hds.algos.twin.config import hyperparams
 from sb3_hds.algos.twin.policy import all_finite
-from sb3_hds.algos.twin.regression import regress_policy, regress_value
-from sb3_hds.algos.twin.state import problem_of
+from sb3_hds.algos.twin.regression import learn_policy, learn_value
+from sb3_hds.algos.twin.state import planning_problem
 from sb3_hds.core import Twin
 from sb3_hds.errors import RewardError
 
@@ -54,8 +52,7 @@ def finite(model) -> bool:
 
 
 def hyper_of(model, gradient_steps):
-    twin = model.twin
-    return hyperparams(model.config, 0, 1e-3, gradient_steps, twin.params, {}, model._view(twin))
+    return model.hyperparams(model.twin, gradient_steps)._replace(learning_rate=1e-3)
 
 
 def close(first, second) -> bool:
@@ -84,17 +81,17 @@ def test_pretraining_is_done_once_without_a_step_of_the_environment():
 
 def test_the_rate_follows_its_schedule_over_the_epochs(monkeypatch):
     model = small("pods", pretrain_epochs=4, learning_rate="lin_1e-2")
-    seen = []
+    rates, hyperparams = [], model.hyperparams
 
     def recorded(*arguments):
-        seen.append(hyperparams(*arguments))
-        return seen[-1]
+        hyper = hyperparams(*arguments)
+        rates.append(float(hyper.learning_rate))
+        return hyper
 
-    monkeypatch.setattr(twin_algorithm, "hyperparams", recorded)
+    monkeypatch.setattr(model, "hyperparams", recorded)
     model.learn(0)
 
     # A straight line from 0.01 to 0 over four epochs.
-    rates = [float(hyper.learning_rate) for hyper in seen]
     np.testing.assert_allclose(rates, [1e-2, 0.75e-2, 0.5e-2, 0.25e-2])
 
 
@@ -197,11 +194,8 @@ def test_the_policy_learns_from_the_first_half_of_plans_and_the_value_from_all()
         mask = where.reshape(1, -1, *[1] * (rows.ndim - 2))
         changed = samples._replace(**{field: jnp.where(mask, rows + 1.0, rows)})
         workspace = state.workspace._replace(samples=changed)
-        key = jax.random.key(0, impl="unsafe_rbg")
-        given = (program, state._replace(workspace=workspace), hyper, key)
-        return state.networks._replace(
-            actor=regress_policy(*given)[0], value=regress_value(*given)[0]
-        )
+        given = (program, state._replace(workspace=workspace), hyper)
+        return state.networks._replace(actor=learn_policy(*given)[0], value=learn_value(*given)[0])
 
     before = learned_with("control", jnp.zeros_like(late))
     assert close(learned_with("control", late).actor, before.actor)
@@ -281,7 +275,7 @@ def test_what_an_end_is_worth_has_a_switch():
     worth = {}
     for shifted in (True, False):
         model = small("pods", "InvertedPendulum-v5", shift_ends=shifted)
-        problem = problem_of(model._program, model._epoch_state(), hyper_of(model, 4))
+        problem = planning_problem(model._program, model._epoch_state(), hyper_of(model, 4))
         worth[shifted] = float(problem.value_when_terminated)
         best = float(problem.reward_offset * problem.reward_scale)
     # A reward of zero for ever, counted from the best one; or nothing.

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from sb3_hds.algos.base.algorithm import ExecutedDictReplayBuffer, ExecutedReplayBuffer
     from sb3_hds.algos.base.policy_file import load_policy
     from sb3_hds.algos.base.threaded_training import TrainBeside
+    from sb3_hds.algos.model_free.sac.algorithm import GSDESAC
     from sb3_hds.algos.model_free.sac.bro import BRO
     from sb3_hds.algos.model_free.sac.compiled import Episodes, learn_compiled
     from sb3_hds.algos.model_free.sac.crossq import CrossQ
     from sb3_hds.algos.model_free.sac.droq import DroQ
-    from sb3_hds.algos.model_free.sac.gsde_sac import GSDESAC
     from sb3_hds.algos.model_free.sac.policy import GaussianPolicy
     from sb3_hds.algos.model_free.sac.simba import SimbaSAC
     from sb3_hds.algos.model_free.sac.tqc import TQC
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     #: every algorithm by its id in the zoo
     ALL: dict[str, Any]
 
+# Public names besides algorithms and policies.
 _OTHERS = {
     "Episodes": "model_free.sac.compiled",
     "ExecutedDictReplayBuffer": "base.algorithm",

@@ -1,9 +1,8 @@
 """
-Every algorithm, once.
+The registry of algorithms.
 
 The public names of ``sb3_hds`` and ``sb3_hds.algos``, the tables of the zoo, ``load_policy``, the
-tests and the documentation read this table. It imports no algorithm: names are resolved on first
-use.
+tests and the documentation read this table. It imports algorithms on first use.
 """
 
 import importlib
@@ -13,12 +12,12 @@ from typing import Any, NamedTuple
 
 class Entry(NamedTuple):
     """
-    Where an algorithm is, and what belongs to it.
+    An algorithm.
 
-    :param name: public name of its class
-    :param module: that defines the class, below ``sb3_hds.algos``
-    :param policies: its policy classes by the name that saved files give them, each with its module
-    :param sampler: of ``rl_zoo3 train -optimize``, a key of ``rl_zoo_plugin.samplers.SAMPLERS``
+    :param name: of its class
+    :param module: of its class, below ``sb3_hds.algos``
+    :param policies: modules of its policies, by the names of their classes
+    :param sampler: for ``rl_zoo3 train -optimize``, a key of ``rl_zoo_plugin.samplers.SAMPLERS``
     """
 
     name: str
@@ -31,11 +30,11 @@ _SAC_POLICY = "model_free.sac.policy"
 _TWIN = {"TwinPolicy": "twin.policy"}
 _GAUSSIAN = {"GaussianPolicy": _SAC_POLICY, "SimbaPolicy": _SAC_POLICY}
 
-#: by id: lower case, the name of the algorithm in the zoo, of its yml file and its documentation
+#: by id, which names the algorithm in the zoo, its yml file and its page in the documentation
 ALGORITHMS: dict[str, Entry] = {
     "pods": Entry("PODS", "twin.pods", _TWIN, "planner"),
     "hds": Entry("HDS", "twin.hds.algorithm", _TWIN, "planner"),
-    "gsde_sac": Entry("GSDESAC", "model_free.sac.gsde_sac", _GAUSSIAN, "gsde"),
+    "gsde_sac": Entry("GSDESAC", "model_free.sac.algorithm", _GAUSSIAN, "gsde"),
     "droq": Entry("DroQ", "model_free.sac.droq", _GAUSSIAN, "sac"),
     "crossq_jax": Entry(
         "CrossQ", "model_free.sac.crossq", {"CrossQPolicy": "model_free.sac.crossq"}, "model_free"
@@ -52,16 +51,17 @@ ALGORITHMS: dict[str, Entry] = {
 }
 
 
-#: module below ``sb3_hds.algos`` of every policy, by its class name
+#: module of every policy below ``sb3_hds.algos``, by the name of its class
 POLICIES = {name: home for entry in ALGORITHMS.values() for name, home in entry.policies.items()}
-#: that of every algorithm and every policy
+#: module of every algorithm and every policy
 MODULES = {entry.name: entry.module for entry in ALGORITHMS.values()} | POLICIES
 
 
 def load(name: str) -> Any:
     """
-    :param name: of an algorithm's class or a policy's
-    :raises KeyError: for one that is not in the table
+    :param name: of the class of an algorithm or a policy
+    :return: the class
+    :raises KeyError: for a name that is not in the table
     """
     return getattr(importlib.import_module(f"sb3_hds.algos.{MODULES[name]}"), name)
 

@@ -5,19 +5,18 @@ Every improver is a function ``(problem, start, first, ...)`` on one trajectory,
 safe under ``jit`` and ``vmap``; :func:`solve` batches one over many start states.
 """
 
-from sb3_hds.planning.batch import METHODS, solve
 from sb3_hds.planning.expansion import Expansion, expand
-from sb3_hds.planning.first_order import control_gradient, gradient_ascent
-from sb3_hds.planning.ilqr import gauss_newton, ilqr, newton_direction
-from sb3_hds.planning.line_search import choose, step_sizes
+from sb3_hds.planning.ilqr import Gains, gauss_newton, ilqr, newton_direction, solve_backward
+from sb3_hds.planning.line_search import choose, control_gradient, gradient_ascent, step_sizes
 from sb3_hds.planning.problem import Plan, Problem, follow, score, simulate
-from sb3_hds.planning.receding_horizon import receding_horizon
-from sb3_hds.planning.riccati import Gains, solve_backward
-from sb3_hds.planning.warm_start import (
+from sb3_hds.planning.solve import (
+    METHODS,
     best_of_random,
     horizon_continuation,
     multi_start,
     random_controls,
+    receding_horizon,
+    solve,
 )
 
 __all__ = [

@@ -9,22 +9,23 @@ from jaxtyping import Array, Float
 from sb3_hds.core import Scalar, State
 from sb3_hds.planning.problem import Control, Plan, Problem
 
-# Value, in units of the scaled objective, at which a turn of the roots counts one half.
+# Value, in units of the scaled objective, at which curvature from rotating roots has weight 1/2.
 _NEAR_GOAL = 0.05
 _LEAST_LENGTH = 1e-6
 
 
 class Expansion(NamedTuple):
     r"""
-    A plan's neighbourhood, in tangent coordinates :math:`\delta x` of the states (dimension n) and
-    changes :math:`\delta u` of the controls (dimension m). Costs are negative, discounted rewards,
+    Local model of a plan in tangent coordinates :math:`\delta x` of the states (dimension n) and
+    changes :math:`\delta u` of the controls (dimension m). Costs are negative discounted rewards,
     zero after termination.
 
     :param A: :math:`\partial x_{t+1} / \partial x_t`, shape ``(horizon, n, n)``
     :param B: :math:`\partial x_{t+1} / \partial u_t`, shape ``(horizon, n, m)``
     :param slope: gradient of the stage cost by (x, u), shape ``(horizon, n + m)``
     :param curvature: Hessian of the stage cost by (x, u), shape ``(horizon, n + m, n + m)``; where
-        the reward looks at the next state, without the second derivative of the step (Gauss-Newton)
+        the reward depends on the next state, without the second derivative of the step
+        (Gauss-Newton)
     :param end_slope: gradient of the terminal cost, shape ``(n,)``
     :param end_curvature: Hessian of the terminal cost, shape ``(n, n)``
     """
@@ -39,9 +40,9 @@ class Expansion(NamedTuple):
 
 def expand(problem: Problem, plan: Plan, second_order: bool = True) -> Expansion:
     """
-    Differentiate one step at every point of a plan. Forward mode only: engines have no other.
+    Differentiate one step at every point of a plan, in forward mode, the only one of some engines.
 
-    :param plan: where to expand
+    :param plan: to expand around
     :param second_order: whether to compute curvatures; zero otherwise
     :return: the local model; its cost derivatives are zero where the episode has terminated
     """
@@ -102,10 +103,10 @@ def _expand_end(problem: Problem, end: State, origin: Float[Array, " n"], second
 
 def _curvature_of_squares(problem: Problem, roots, end: State, origin: Float[Array, " n"]):
     r"""
-    Gauss-Newton Hessian of :math:`-|\rho|^2`. Of :math:`(\partial\rho/\partial x)^\top
-    (\partial\rho/\partial x)`, the part that rotates :math:`\rho` without lengthening it is
-    curvature only near the goal, where :math:`\rho` is zero. Elsewhere it is an arbitrary choice of
-    the network, so its share fades.
+    Gauss-Newton Hessian of :math:`-|\rho|^2`. The part of :math:`(\partial\rho/\partial x)^\top
+    (\partial\rho/\partial x)` that rotates :math:`\rho` without lengthening it is curvature only
+    near the goal, where :math:`\rho` is zero. Elsewhere it is an arbitrary choice of the network,
+    so its weight fades.
     """
     at = lambda dx: roots(problem.observe(problem.twin.retract(end, dx)))  # noqa: E731
     rho, jacobian = at(origin), jax.jacfwd(at)(origin)

@@ -45,17 +45,17 @@ class Problem:
     the objective by a constant only and does not reward termination. There is no auto-reset.
     Without ``shift_ends`` a termination has the value zero, more than any reward below :math:`r_0`.
 
-    :param twin: what is simulated
-    :param params: its parameters
+    :param twin: the simulation
+    :param params: parameters of the twin
     :param discount: :math:`\gamma` per step, in (0, 1]
     :param reward_scale: :math:`s`
     :param reward_offset: :math:`r_0`; must be zero where the discount is one
     :param terminal_value: :math:`V`, scaled like the rewards; None means zero
     :param terminal_curvature: whether second-order methods use the Hessian of :math:`V` too
     :param terminal_roots: observation to :math:`\rho`, shape ``(k,)``, with :math:`V \approx c -
-        |\rho|^2`. Their Gauss-Newton curvature replaces the Hessian of :math:`V`: it never has the
-        wrong sign, and is as smooth as a gradient.
-    :param shift_ends: whether an episode that has terminated is shifted with the rewards
+        |\rho|^2`. Their Gauss-Newton curvature replaces the Hessian of :math:`V`: it is never
+        positive, and as smooth as a gradient.
+    :param shift_ends: whether the value after termination is shifted with the rewards
     """
 
     twin: Twin
@@ -77,7 +77,7 @@ class Problem:
         return dataclasses.replace(self, params=self.params | params) if params else self
 
     def action(self, control: Control) -> Action:
-        """:return: the command in the units of the action space for a control in [-1, 1]"""
+        """:return: the action, in units of the action space, for a control in [-1, 1]"""
         low = jnp.array([actuator.low for actuator in self.twin.actuators], control.dtype)
         high = jnp.array([actuator.high for actuator in self.twin.actuators], control.dtype)
         return low + 0.5 * (control + 1.0) * (high - low)
@@ -87,7 +87,7 @@ class Problem:
         return self.twin.step(state, self.action(control), self.params)
 
     def reward(self, state: State, control: Control, after: State) -> Scalar:
-        """:return: the scaled, shifted planning reward of getting from ``state`` to ``after``"""
+        """:return: the scaled, shifted planning reward of the step from ``state`` to ``after``"""
         reward = self.twin.planning_reward(state, self.action(control), after, self.params)
         return (reward - self.reward_offset) * self.reward_scale
 
@@ -105,7 +105,7 @@ class Problem:
         return -jnp.asarray(self.reward_offset * self.reward_scale) / (1.0 - self.discount)
 
     def value_at_end(self, state: State) -> Scalar:
-        """:return: the terminal value of a state in which the episode still runs"""
+        """:return: the terminal value of a state that is not terminated"""
         if self.terminal_value is None:
             return jnp.zeros(())
         return self.terminal_value(self.observe(state))
@@ -113,29 +113,35 @@ class Problem:
 
 def simulate(problem: Problem, start: State, controls: Controls) -> Plan:
     """Roll out a control sequence and score it."""
-    return _roll(problem, start, lambda state, control: control, controls, controls.shape[0])
+    return roll_out(problem, start, lambda _, control: control, controls, controls.shape[0])
 
 
 def simulated(problem: Problem, start: State, first: Controls | Plan) -> Plan:
-    """:return: the plan of the controls from ``start``; an existing plan is returned as it is"""
+    """:return: the plan of the controls from ``start``; a plan is returned unchanged"""
     return first if isinstance(first, Plan) else simulate(problem, start, first)
 
 
 def follow(problem: Problem, start: State, policy: Callable[[Obs], Control], n_steps: int) -> Plan:
     """
-    Roll out a policy and score what it does.
+    Roll out a policy and score it.
 
-    :param policy: observation of the twin to control; clipped to [-1, 1]
+    :param policy: maps an observation of the twin to a control; clipped to [-1, 1]
     :param n_steps: length of the plan
     """
 
     def decide(state: State, _: None) -> Control:
         return jnp.clip(policy(problem.observe(state)), -1.0, 1.0)
 
-    return _roll(problem, start, decide, None, n_steps)
+    return roll_out(problem, start, decide, None, n_steps)
 
 
-def _roll(problem: Problem, start: State, decide: Callable, inputs: Any, length: int) -> Plan:
+def roll_out(problem: Problem, start: State, decide: Callable, inputs: Any, length: int) -> Plan:
+    """
+    :param decide: maps a state and its slice of ``inputs`` to a control in [-1, 1]
+    :param inputs: pytree whose leaves have a leading axis of ``length``; None: no inputs
+    :return: the simulated and scored plan of these decisions
+    """
+
     def advance(carry: tuple[State, Flag], given: Any):
         state, alive = carry
         control = decide(state, given)
@@ -158,7 +164,7 @@ def assemble(
     rewards: Float[Array, " horizon"],
     controls: Controls,
 ) -> Plan:
-    """:return: the plan made of the steps taken and the state reached, scored"""
+    """:return: the scored plan that consists of these steps and the final state"""
     states = jax.tree.map(lambda path, last: jnp.concatenate([path, last[None]]), states, end)
     lived = jnp.append(alive, alive_at_end)
     value = score(problem, rewards, lived, problem.value_at_end(end))

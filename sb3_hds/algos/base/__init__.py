@@ -1,6 +1,6 @@
-"""What all algorithms share: construction, policies, files, the way in through SB3."""
+"""What all algorithms share: construction, configs, policies, saved files, SB3's ``learn``."""
 
 from sb3_hds.lazy import postpone
 
-# SBX's base class is all that is needed of it here; its algorithms import TensorFlow Probability.
+# Only SBX's base class is needed; its algorithms import TensorFlow Probability.
 postpone("sbx")

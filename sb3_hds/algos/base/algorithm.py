@@ -1,5 +1,4 @@
-"""What all our algorithms share: one way in, weights as tensors, files that are whole or not there,
-and no measurement that is not finite."""
+"""What all off-policy algorithms share: ``learn``, checks of measurements, executed actions."""
 
 import copy
 import io
@@ -25,20 +24,20 @@ from sb3_hds.algos.base.construct import (
     check_origin,
     check_policy_kwargs,
 )
-from sb3_hds.algos.base.files import by_names, damaged, write_whole
+from sb3_hds.algos.base.files import damaged, write_whole
 from sb3_hds.algos.base.policy import TensorPolicy
 from sb3_hds.algos.base.saving import SavesTensors
-from sb3_hds.errors import EnvironmentMismatchError
+from sb3_hds.algos.nets.options import by_names
 
-# Steps per second below which a learner says what would make it faster.
+# Steps per second below which a learner warns and suggests faster settings.
 _SLOW = 5.0
-# The first calls of ``train``, which compile, are ignored; then updates are timed, until there are
-# enough of them, or for long enough [s].
+# Calls of ``train`` that compile and are not timed; then the number of updates to time, or the time
+# after which fewer are enough [s].
 _COMPILING, _UPDATES, _SECONDS = 2, 100, 10.0
 _STATISTICS = ("obs_rms", "ret_rms", "returns")
-# How far beyond its limits a stored action may be because of single precision, as a share of them.
+# Tolerance of the limits of a stored action, for single precision, in scaled actions.
 _ROUNDING = 1e-5
-# How far what arrives at a layer may be from what was chosen, as a share of the range.
+# Tolerance between the chosen action and the one that a layer received, as a share of the range.
 _REACHED = 1e-4
 
 
@@ -46,15 +45,15 @@ def executed(
     space: spaces.Space, chosen: np.ndarray, infos: Sequence[Mapping[str, Any]]
 ) -> np.ndarray:
     """
-    The actions to store: ``info["stored_action"]`` where a layer of ``sb3_hds.wrappers`` asks for
-    that by ``store="executed"``, otherwise what was chosen.
+    The actions to store: ``info["stored_action"]`` where a layer of ``sb3_hds.wrappers`` sets it
+    (``store="executed"``), otherwise the chosen ones.
 
-    :param space: of the actions
+    :param space: action space
     :param chosen: scaled to [-1, 1] where the space is a Box, shape ``(n_envs, n_act)``
     :param infos: of the step, one for each environment
-    :return: as ``chosen``
-    :raises ValueError: for a stored action that is not in the space, or where the layer was given
-        another action than was chosen
+    :return: scaled actions, shape of ``chosen``
+    :raises ValueError: for a stored action outside the space, and for a layer that received another
+        action than the chosen one
     """
     given = [info.get("stored_action") for info in infos]
     if all(action is None for action in given) or not isinstance(space, spaces.Box):
@@ -69,7 +68,7 @@ def executed(
 
 
 class _StoresExecuted:
-    """Adds the actions that were executed (see :func:`executed`)."""
+    """Stores executed actions (see :func:`executed`)."""
 
     action_space: spaces.Space
 
@@ -89,44 +88,44 @@ class _StoresExecuted:
 
 class ExecutedReplayBuffer(_StoresExecuted, ReplayBuffer):
     """
-    SB3's replay buffer, with the actions that were executed (see :func:`executed`), for learners of
+    SB3's replay buffer, which stores executed actions (see :func:`executed`), for algorithms of
     Stable-Baselines3 and SBX: ``SAC(..., replay_buffer_class=ExecutedReplayBuffer)``. The
-    model-free algorithms of this package need none: they look themselves.
+    model-free algorithms of this package store them in any replay buffer.
     """
 
 
 class ExecutedDictReplayBuffer(_StoresExecuted, DictReplayBuffer):
-    """The same for Dict observations."""
+    """:class:`ExecutedReplayBuffer` for Dict observations."""
 
 
 def _check_reached(space: spaces.Box, chosen: np.ndarray, info: Mapping[str, Any]) -> None:
     raw = info.get("raw_action")
-    # Where a watchdog acted instead, nothing of what was chosen was executed.
+    # After `command_dropped`, a watchdog acted and nothing of the chosen action was executed.
     if raw is None or info.get("command_dropped"):
         return
     low, high = space.low.astype(float), space.high.astype(float)
     wanted = low + 0.5 * (chosen.reshape(space.shape) + 1.0) * (high - low)
     if not np.allclose(raw, wanted, rtol=0.0, atol=_REACHED * np.max(high - low)):
         raise ValueError(
-            f"A layer asks to store what was executed for the action {raw}, and {wanted} was "
-            "chosen. Some wrapper outside that layer changes actions, for example rescales them: "
-            "put it below, or use store='raw'."
+            f"A layer asks to store the executed form of action {raw}, but {wanted} was chosen. A "
+            "wrapper outside that layer changes actions, for example by rescaling them: move it "
+            "below the layer, or use store='raw'."
         )
 
 
 def _scaled(space: spaces.Box, action: np.ndarray) -> np.ndarray:
-    """As ``BasePolicy.scale_action``."""
+    """``BasePolicy.scale_action`` in double precision, for actions within the limits only."""
     low, high = space.low.astype(float), space.high.astype(float)
     scaled = 2.0 * (action - low) / (high - low) - 1.0 if action.shape == space.shape else action
     if action.shape != space.shape or not np.all(np.abs(scaled) <= 1.0 + _ROUNDING):
         raise ValueError(
-            f"A layer asks to store the action {action}, which is not in {space}. Some wrapper "
-            "outside that layer rescales actions: put it below, or use store='raw'."
+            f"A layer asks to store the action {action}, which is not in {space}. A wrapper "
+            "outside that layer rescales actions: move it below the layer, or use store='raw'."
         )
     return np.clip(scaled, -1.0, 1.0)
 
 
-# Pickles of a buffer name the public package, which stays where it is.
+# Pickled buffers refer to the public package, whose name does not change.
 ExecutedReplayBuffer.__module__ = ExecutedDictReplayBuffer.__module__ = "sb3_hds.algos"
 
 
@@ -134,12 +133,12 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
     """Abstract: an off-policy algorithm whose policy is a :class:`TensorPolicy`."""
 
     default_timesteps: ClassVar[int] = 1_000
-    #: whether a layer around the environment may decide that executed actions are stored
+    #: whether a wrapper may have executed actions stored in place of the chosen ones
     stores_executed: ClassVar[bool] = True
-    #: what a policy class must extend
+    #: base class that every policy of the algorithm extends
     policy_family: ClassVar[type[TensorPolicy]] = TensorPolicy
     policy: TensorPolicy
-    #: of ``VecNormalize``, as they were after the last step that was stored
+    #: statistics of ``VecNormalize`` after the last stored step
     _statistics: dict[str, Any] | None = None
 
     def construct(self, config: OffPolicyConfig, **more: Any) -> None:
@@ -148,7 +147,7 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
 
     @property
     def network_seed(self) -> int:
-        """After a reset of the networks, another one."""
+        """Seed of the next networks; each reset of the networks has its own."""
         return int(np.asarray(self.key)[-1]) + self.reset_idx
 
     def learn(  # type: ignore[override]
@@ -161,14 +160,17 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         progress_bar: bool = False,
     ) -> Self:
         """
-        Act in the environment and learn from it.
+        Act in the environment and learn from it, PODS and HDS after their pretraining in the twin.
 
-        :param total_timesteps: steps of the *environment*; default ``default_timesteps``
-        :param callback: called at every step of the environment
+        :param total_timesteps: steps of the *environment*; default ``default_timesteps``. With 0,
+            PODS and HDS run their pretraining only.
+        :param callback: called at every step of the environment; with PODS and HDS also after every
+            planning epoch of the pretraining, with ``locals["pretraining"]`` and no timestep
+            counted
         :param log_interval: episodes between two log lines
         :param tb_log_name: name of the run for TensorBoard; default: the class's name
-        :param reset_num_timesteps: False goes on counting
-        :param progress_bar: show one
+        :param reset_num_timesteps: False continues the count of timesteps
+        :param progress_bar: whether to show a progress bar
         """
         check_log_interval(log_interval)
         if total_timesteps is None:
@@ -186,7 +188,7 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         """
-        :raises ValueError: where what the environment begins with is not finite
+        :raises ValueError: for a first observation that is not finite
         """
         self._keep_statistics()
         self._pace.pause()
@@ -209,7 +211,7 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         """
 
     def remedies(self, updates_per_step: float) -> list[str]:
-        """:return: what would make a slow learner faster, as arguments"""
+        """:return: arguments that would make a slow learner faster, for a warning"""
         raise NotImplementedError
 
     def _store_transition(
@@ -238,10 +240,10 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         self, new_obs: np.ndarray | dict[str, np.ndarray], reward: np.ndarray, dones: np.ndarray
     ) -> None:
         """
-        A step of every environment is in the replay buffer.
+        Called after a step of every environment was added to the replay buffer.
 
-        :param new_obs: after it, normalised as policies see it
-        :param reward: shape ``(n_envs,)``, normalised where the environment is
+        :param new_obs: observations after the step, normalised as policies see them
+        :param reward: shape ``(n_envs,)``, normalised by ``VecNormalize`` if there is one
         :param dones: whether the episode ended, shape ``(n_envs,)``
         """
 
@@ -252,7 +254,7 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
             self._statistics = {name: copy.deepcopy(getattr(normalizer, name)) for name in held}
 
     def _refuse_unless_finite(self, what: str, *measured: Any) -> None:
-        """``VecNormalize`` has counted it already, and clips what is infinite."""
+        """``VecNormalize`` clips infinities, so check the raw values; undo its statistics, too."""
         normalizer = self._vec_normalize_env
         given = measured
         if normalizer is not None:
@@ -279,30 +281,37 @@ class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
         truncate_last_traj: bool = True,
     ) -> None:
         """
-        SB3's ``load_replay_buffer``, which unpickles: load what you have saved yourself.
+        SB3's ``load_replay_buffer``. It unpickles: load only files that you saved yourself.
 
         :param path: of a file that ``save_replay_buffer`` wrote; ``.pkl`` may be left out
-        :param truncate_last_traj: of a buffer of HER, whether its last episode has ended
-        :raises ValueError: for a damaged file, and for a buffer of another environment; that of
-            before is then still there
+        :param truncate_last_traj: for ``HerReplayBuffer``: whether to end the last episode
+        :raises ValueError: for a damaged file, for a buffer of another environment, and for one
+            that the algorithm cannot use; the model then keeps its buffer
         """
         before: Any = getattr(self, "replay_buffer", None)
         try:
             super().load_replay_buffer(path, truncate_last_traj)
         except (OSError, AssertionError):
             raise
-        # Where pickle meets damage, it may raise anything.
+        # Unpickling a damaged file may raise anything.
         except Exception as error:
             if getattr(self, "replay_buffer", None) is not before:
                 raise
             raise damaged(path, error) from error
         try:
-            check_buffer(self, self.replay_buffer, path)
-        except EnvironmentMismatchError:
+            self.check_replay_buffer(self.replay_buffer, path)
+        except ValueError:
             self.replay_buffer = before
             raise
-        # SBX marks the buffer as the CPU's, where SB3 has the model's device.
+        # SB3 expects the model's device here; SBX sets the CPU.
         self.replay_buffer.device = self.device  # type: ignore[union-attr]
+
+    def check_replay_buffer(self, buffer: Any, path: Any) -> None:
+        """
+        :param buffer: object that was read from ``path``
+        :raises ValueError: for a buffer that the algorithm cannot use
+        """
+        check_buffer(self, buffer, path)
 
     def _setup_model(self) -> None:
         check_origin(type(self), self.saved_by)
@@ -333,8 +342,8 @@ def _is_finite(measured: Any) -> bool:
 
 class Pace:
     """
-    Looks at a learner's first hundred updates, once their programs are compiled. The environment,
-    and callbacks, may be as slow as they like.
+    Times a learner's first hundred updates after compilation and warns if they are slow. Time spent
+    in the environment and in callbacks does not count.
     """
 
     def __init__(self) -> None:
@@ -343,21 +352,21 @@ class Pace:
         self.pause()
 
     def pause(self) -> None:
-        """What comes next are no updates."""
+        """Stop timing until the next collection of steps ends."""
         self._since: float | None = None
 
     def collected(self, model: "TensorAlgorithm", n_steps: int) -> None:
         """
-        Updates may begin.
+        Start timing: a collection of steps has ended, and its updates follow.
 
-        :param n_steps: of the environment, for which they are
+        :param n_steps: steps of the environment in the collection
         """
         if not self._done:
             self._since = time.perf_counter()
             self._new_steps, self._updates_before = n_steps, model._n_updates
 
     def updated(self, model: "TensorAlgorithm") -> None:
-        """Updates, if there were some, have been made."""
+        """Count the updates since :meth:`collected`, if there were any."""
         if self._since is None or model._n_updates == self._updates_before:
             return
         seconds, self._since = time.perf_counter() - self._since, None
@@ -374,6 +383,6 @@ class Pace:
         if rate < _SLOW:
             remedies = model.remedies(self._updates / max(self._steps, 1))
             warnings.warn(
-                f"{type(model).__name__} makes {rate:.2g} steps/s, since the updates for each of "
-                f"them take {1.0 / rate:.2g} s. What would make it faster: {'; '.join(remedies)}."
+                f"{type(model).__name__} makes {rate:.2g} steps/s, since the updates for each step "
+                f"take {1.0 / rate:.2g} s. What would make it faster: {'; '.join(remedies)}."
             )

@@ -1,9 +1,9 @@
 """
 Arguments of constructors.
 
-Each algorithm has one frozen dataclass whose fields are its arguments: there they are named,
-documented, given a default and checked, once. :func:`takes` makes a constructor of it that editors,
-``help`` and ``inspect.signature`` see through.
+Each algorithm has one frozen dataclass, whose fields are its arguments with their defaults,
+documentation and checks. :func:`takes` turns it into a constructor whose signature editors,
+``help`` and ``inspect.signature`` show.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ AnyConfig = TypeVar("AnyConfig")
 Rate = float | str | Schedule
 
 _LARGEST_SEED = 2**32 - 1
-# What SB3's ``load`` may change besides arguments of the constructor.
+# Arguments of SB3's ``load`` that are not arguments of the constructor.
 _OF_LOAD = ("custom_objects", "print_system_info", "force_reset", "n_envs", "num_timesteps")
 
 
@@ -37,8 +37,8 @@ def takes(
     config: Callable[P, AnyConfig],
 ) -> Callable[[Callable[[Any, AnyConfig], None]], Callable[Concatenate[Any, P], None]]:
     """
-    Decorates a constructor that is written for a config: it then takes the config's fields. After
-    it, ``set_up`` is called.
+    Decorate a constructor that takes a config: it takes the config's fields instead, and calls
+    ``set_up`` at its end.
 
     :param config: a dataclass
     """
@@ -46,7 +46,7 @@ def takes(
     def decorate(construct: Callable[[Any, AnyConfig], None]) -> Any:
         @functools.wraps(construct)
         def construct_from_fields(self: Any, *args: P.args, **kwargs: P.kwargs) -> None:
-            # SB3's private argument: while loading, a model is set up later.
+            # SB3's private argument: ``load`` sets a model up later.
             set_up = kwargs.pop("_init_setup_model", True)
             check_known(type(self), config, kwargs)
             construct(self, config(*args, **kwargs))
@@ -65,7 +65,7 @@ def takes(
 
 
 def _documentation(config: Any) -> str:
-    """:return: every field with what the most derived config that documents it says of it"""
+    """:return: the ``:param:`` entry of every field, from the most derived config that has one"""
     found: dict[str, str] = {}
     for kind in reversed(config.__mro__):
         text = inspect.cleandoc(kind.__doc__ or "")
@@ -100,9 +100,9 @@ class Config:
     :param policy: ``"MlpPolicy"``, a policy class, or the environment itself
     :param env: an environment, its id, or a vectorised environment
     :param policy_kwargs: arguments of the policy
-    :param stats_window_size: episodes in the averages that are logged
+    :param stats_window_size: episodes in the logged averages
     :param tensorboard_log: folder for TensorBoard
-    :param verbose: 0 nothing, 1 information, 2 debugging
+    :param verbose: 0: no output, 1: information, 2: debugging
     :param seed: of all random numbers
     :param device: ``"auto"``, ``"cpu"`` or ``"cuda"``, as in JAX
     :param monitor_wrapper: whether SB3 may wrap the environment in its ``Monitor``
@@ -118,20 +118,20 @@ class Config:
     seed: int | None = None
     device: str = "auto"
     monitor_wrapper: bool = True
-    #: arguments that may be None, which then are derived
+    #: arguments that may be None and are then derived from others
     derived: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def of(cls, model: Any) -> Any:
-        """:return: the arguments as the model's attributes have them now, checked"""
+        """:return: the current values of the arguments, from the model's attributes, checked"""
         held = vars(model)
         names = [name for name in arguments_of(cls) if name in held and name not in _OBJECTS]
         return cls(**{name: held[name] for name in names})
 
     def __post_init__(self) -> None:
         """
-        :raises ValueError: for a value out of range, with the range
-        :raises TypeError: for a value of another kind
+        :raises ValueError: for a value out of range
+        :raises TypeError: for a value of the wrong type
         """
         self._require_mapping("policy_kwargs")
         seed = self.seed
@@ -142,16 +142,17 @@ class Config:
 
     def require(self, fine: bool, name: str, allowed: str) -> None:
         """
+        :param fine: whether the value is allowed
         :param name: of the argument
-        :param allowed: what it may be
-        :raises ValueError: unless it is fine
+        :param allowed: which values are, for the message
+        :raises ValueError: unless ``fine``
         """
         if not fine:
             raise ValueError(self._objection(name, allowed))
 
     def require_counts(self, fewest: Mapping[str, int]) -> None:
         """
-        :param fewest: for each argument the least that makes sense
+        :param fewest: smallest allowed value of each argument
         """
         for name, least in fewest.items():
             may_be_none = name in self.derived
@@ -160,14 +161,14 @@ class Config:
 
     def require_range(self, low: float, high: float, allowed: str, *names: str) -> None:
         """
-        :param names: of arguments that are finite numbers from ``low`` to ``high``
+        :param names: of arguments that must be finite numbers from ``low`` to ``high``
         """
         for name in names:
             self.require(between(getattr(self, name), low, high), name, allowed)
 
     def require_choice(self, name: str, choices: Sequence[Any]) -> None:
         """
-        :param choices: what the argument may be
+        :param choices: allowed values
         """
         allowed = f"one of {', '.join(map(repr, choices))}"
         self.require(getattr(self, name) in choices, name, allowed)
@@ -176,7 +177,7 @@ class Config:
         self.require(isinstance(getattr(self, name), bool | np.bool_), name, "True or False")
 
     def is_default(self, name: str) -> bool:
-        """:return: whether the argument has the value that it has unless it is given"""
+        """:return: whether the argument has its default value"""
         defaults = {field.name: field.default for field in dataclasses.fields(self)}
         return getattr(self, name) == defaults[name]
 
@@ -192,7 +193,7 @@ class Config:
         return f"{algorithm}({name}={getattr(self, name)!r}): {name} must be {allowed}."
 
 
-# Attributes of a model that are no longer what was passed under that name.
+# Attributes of a model that are objects made of the arguments of the same name.
 _OBJECTS = ("policy", "env")
 
 
@@ -202,12 +203,12 @@ class OffPolicyConfig(Config):
     Arguments of every algorithm that learns from a replay buffer.
 
     :param learning_rate: number, schedule or ``"lin_3e-4"``
-    :param buffer_size: transitions that are kept
+    :param buffer_size: capacity of the replay buffer [transitions]
     :param learning_starts: steps with random actions before learning starts
     :param batch_size: samples per gradient step
     :param gamma: discount per step of the environment
     :param train_freq: steps between two calls of ``train``, or ``(n, "episode")``
-    :param gradient_steps: in each of them; -1: as many as steps were made
+    :param gradient_steps: per call of ``train``; -1: as many as environment steps since the last
     :param action_noise: added to the actions
     """
 
@@ -282,7 +283,7 @@ def schedule_of(rate: float | str | Schedule) -> Schedule:
     """
     :param rate: a number, a function of the remaining progress (from 1 to 0), or ``"lin_3e-3"`` as
         in the zoo
-    :raises ValueError: for any other string, and for a negative number in one
+    :raises ValueError: for any other string, and for a negative number in a string
     """
     if not isinstance(rate, str):
         return FloatSchedule(float(rate) if isinstance(rate, numbers.Real) else rate)

@@ -1,13 +1,10 @@
-"""
-The ways in which an algorithm may be called; for each mistake, one line that says what to do.
-"""
+"""Call forms of the constructors, and checks of arguments whose errors say how to fix the call."""
 
 import inspect
 import math
 import numbers
 import warnings
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -25,9 +22,10 @@ from sb3_hds.algos import registry
 from sb3_hds.algos.base.config import is_whole
 from sb3_hds.errors import EnvironmentMismatchError, did_you_mean
 
+# Characters of a value that a message shows.
 _LONGEST = 200
 _GOALS = {"observation", "achieved_goal", "desired_goal"}
-# What the constructors of policies are given by their algorithm, and what only SB3's have.
+# Arguments of policies that their algorithm passes, and those that only SB3's policies have.
 _OF_ALGORITHMS = ("observation_space", "action_space", "lr_schedule", "use_sde")
 _OF_TORCH = (
     "features_extractor_class",
@@ -45,14 +43,15 @@ def policy_and_env(
     monitor_wrapper: bool,
 ) -> tuple[Any, Any]:
     """
-    A lone environment, or a lone string that names no policy, is the environment:
-    ``HDS("Pendulum-v1")`` means ``HDS("MlpPolicy", "Pendulum-v1")``.
+    A single argument that names no policy is the environment: ``HDS("Pendulum-v1")`` means
+    ``HDS("MlpPolicy", "Pendulum-v1")``.
 
     :param check: raises for observations that the algorithm cannot use
-    :param monitor_wrapper: whether SB3 may wrap a lone environment in its ``Monitor``
-    :return: policy and environment in SB3's order; the environment made, if it was a string
-    :raises EnvironmentMismatchError: for what is no environment, and for observations and actions
-        that the algorithm cannot use
+    :param monitor_wrapper: whether SB3 may wrap an environment that is not vectorised in
+        ``Monitor``
+    :return: policy and environment in SB3's order; an id is replaced by its environment
+    :raises EnvironmentMismatchError: unless ``env`` is an environment with observations and actions
+        that the algorithm can use
     :raises ValueError: for a policy that it cannot use
     """
     names_env = isinstance(policy, str) and not policy.endswith("Policy")
@@ -65,20 +64,16 @@ def policy_and_env(
         of_several = isinstance(env.observation_space, spaces.Dict)
         policy = policy or ("MultiInputPolicy" if of_several else "MlpPolicy")
         if isinstance(env, gym.Env) and not monitor_wrapper:
-            # SBX does not hand the argument on to SB3, which leaves vectorised ones as they are.
-            env = DummyVecEnv([partial(_itself, env)])
+            # SBX does not pass the argument on to SB3, which wraps no vectorised environment.
+            env = DummyVecEnv([lambda made=env: made])
     return _checked_policy(algorithm, policy), env
-
-
-def _itself(env: gym.Env) -> gym.Env:
-    return env
 
 
 def check_policy_kwargs(policy: type, policy_kwargs: Iterable[str]) -> None:
     """
     :param policy: a class
-    :param policy_kwargs: names of what it is made with, besides what algorithms pass
-    :raises TypeError: for what it has no argument of, as Python does
+    :param policy_kwargs: names of the arguments that the user passes
+    :raises TypeError: for a name that is none of its arguments
     """
     parameters = inspect.signature(policy).parameters
     if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
@@ -97,9 +92,9 @@ def check_policy_kwargs(policy: type, policy_kwargs: Iterable[str]) -> None:
 
 def _checked_policy(algorithm: Any, policy: Any) -> Any:
     """
-    :return: the policy, a class where it was the name of one
+    :return: the policy; the name of a policy class in saved files is replaced by the class
     :raises ValueError: for a name that the algorithm does not know, and for a policy class of
-        another algorithm, as its saved files name it
+        another algorithm
     """
     known = algorithm.policy_aliases
     if isinstance(policy, str) and policy not in known:
@@ -116,8 +111,8 @@ def _checked_policy(algorithm: Any, policy: Any) -> Any:
 
 def check_origin(algorithm: type, saved_by: str) -> None:
     """
-    :param saved_by: name of the class whose arguments a model has
-    :raises ValueError: if that is neither this class nor one that it extends
+    :param saved_by: name of the class that saved the model
+    :raises ValueError: unless that is this class or one that it extends
     """
     if saved_by not in (parent.__name__ for parent in algorithm.__mro__):
         raise ValueError(
@@ -126,7 +121,7 @@ def check_origin(algorithm: type, saved_by: str) -> None:
 
 
 def in_one_line(what: Any) -> str:
-    """:return: as it prints itself, shortened"""
+    """:return: ``str(what)`` without line breaks, shortened for a message"""
     text = " ".join(str(what).split())
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
@@ -184,8 +179,8 @@ def check_action_space(algorithm: type, space: spaces.Space) -> None:
 
 def check_buffer_class(algorithm: type, kind: Any, space: spaces.Space) -> None:
     """
-    :param kind: of replay buffers; None: the usual one
-    :raises EnvironmentMismatchError: for hindsight where there are no goals
+    :param kind: class of the replay buffer; None: the default
+    :raises EnvironmentMismatchError: for ``HerReplayBuffer`` with observations that have no goals
     """
     relabels = isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
     names = set(space.spaces) if isinstance(space, spaces.Dict) else set()
@@ -200,8 +195,9 @@ def check_buffer_class(algorithm: type, kind: Any, space: spaces.Space) -> None:
 
 def check_buffer(model: Any, buffer: Any, path: Any) -> None:
     """
-    :param buffer: that was read
-    :raises EnvironmentMismatchError: if it is of another environment, or none
+    :param buffer: object that was read from ``path``
+    :raises EnvironmentMismatchError: unless it is a replay buffer of an environment like the
+        model's
     """
     if not isinstance(buffer, ReplayBuffer):
         raise EnvironmentMismatchError(
@@ -230,7 +226,7 @@ def check_has_env(model: Any) -> None:
         )
 
 
-def whole_steps(total_timesteps: Any) -> int:
+def checked_timesteps(total_timesteps: Any) -> int:
     """
     :param total_timesteps: also as 1e5
     :raises ValueError: unless it is a whole number of at least 0
@@ -273,7 +269,7 @@ def callbacks_of(given: Any) -> list[BaseCallback]:
 def as_list(name: str, given: Any, kind: type) -> list[Any]:
     """
     :param name: of the argument
-    :param given: names or objects of a kind, or a single one
+    :param given: a list of names and of objects of class ``kind``, or a single one of them
     :raises TypeError: for anything else
     """
     several = [given] if isinstance(given, str | kind) else given
@@ -287,8 +283,7 @@ def as_list(name: str, given: Any, kind: type) -> list[Any]:
 
 def device_or_cpu(device: Any) -> Any:
     """
-    A model that was trained on an accelerator must load where there is none: as in SB3, ``"cuda"``
-    then means the CPU.
+    As in SB3, a model that was trained on an accelerator loads on the CPU where there is none.
 
     :return: ``device``, or ``"cpu"``, with a warning
     """

@@ -1,12 +1,11 @@
 """
-Weights as tensors inside SB3's own zip format, so that a saved model outlives the JAX that wrote
-it.
+Files of models: weights as tensors inside SB3's zip format, independent of the version of JAX.
 
 SB3 saves every attribute that an algorithm lists in ``_get_torch_save_params`` by its
 ``state_dict``, and reads it back with ``torch.load(weights_only=True)``. A policy built on
-:class:`TensorPolicy` answers that protocol for its pytrees; nothing of JAX or Flax is pickled.
+:class:`TensorPolicy` implements that protocol for its pytrees; nothing of JAX or Flax is pickled.
 
-A file appears under its name only when it is complete (:func:`write_whole`).
+Files are written atomically (:func:`write_whole`).
 """
 
 import contextlib
@@ -16,7 +15,7 @@ import os
 import pickle
 import secrets
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,6 @@ import jax.numpy as jnp
 import numpy as np
 import torch as th
 
-from sb3_hds.algos.nets.options import activation_name, optimizer_name
-
 
 def write_whole(
     path: str | os.PathLike[str] | io.BufferedIOBase,
@@ -34,13 +31,13 @@ def write_whole(
     write: Callable[[io.BufferedIOBase], None],
 ) -> None:
     """
-    Write under a temporary name in the same folder, then rename: whoever reads the folder, also
-    after the process was killed, finds the new file, or the older one of that name, never a half.
+    Write atomically: under a temporary name in the same folder, then rename. Also after the process
+    was killed, there is either the complete new file or the older one.
 
-    :param path: of the file, whose folders are made; something open for writing is just written to
+    :param path: of the file, whose folders are made; an open file is written to directly
     :param suffix: without a dot, appended to a name that has none, as SB3 does
     :param write: is called with the open file
-    :raises OSError: if the file cannot be written; an older one is then left as it was
+    :raises OSError: if the file cannot be written; an older file is then unchanged
     """
     if not isinstance(path, str | os.PathLike):
         write(path)
@@ -67,20 +64,20 @@ def write_whole(
 
 def refuse_damaged(path: str | os.PathLike[str] | io.BufferedIOBase, *parts: str) -> None:
     """
-    Read a zip file once, so that what fails later is not the file.
+    Read a whole zip file, so that damage is reported before anything is loaded.
 
-    A file that was cut off may still look like a zip file, because the weights in it are one each.
+    A truncated file may still look like a zip file, because the weights in it are zip files, too.
 
-    :param path: of the file, or the file; ``.zip`` may be left out
-    :param parts: that must be in it
-    :raises OSError: if it is not there, or cannot be opened
-    :raises ValueError: in one line, if it is damaged, or is something else
+    :param path: path of a file, or an open file; ``.zip`` may be left out
+    :param parts: names of entries that it must contain
+    :raises OSError: if it does not exist, or cannot be opened
+    :raises ValueError: if it is damaged, or is no zip file
     """
     with _opened(path) as file:
         begin = file.tell()
         try:
             with zipfile.ZipFile(file) as archive:
-                # What zipfile raises where a header is damaged has many types.
+                # For a damaged header, zipfile raises many types of errors.
                 broken, missing = archive.testzip(), set(parts) - set(archive.namelist())
         except Exception as error:
             raise damaged(path, error) from error
@@ -91,9 +88,9 @@ def refuse_damaged(path: str | os.PathLike[str] | io.BufferedIOBase, *parts: str
 
 def damaged(path: Any, reason: Any) -> ValueError:
     """
-    :param path: of a file, or the file
+    :param path: path of a file, or an open file
     :param reason: why it cannot be read
-    :return: the error that says so, in one line
+    :return: the error to raise, with a message of one line
     """
     kind = f"{type(reason).__name__}: " if isinstance(reason, Exception) else ""
     found = kind + " ".join(str(reason).split())
@@ -104,16 +101,16 @@ def damaged(path: Any, reason: Any) -> ValueError:
 
 
 def name_of(path: Any) -> str:
-    """:return: of a file, to begin a message with"""
+    """:return: how a message names a path or an open file"""
     return f"'{path}'" if isinstance(path, str | os.PathLike) else "The file"
 
 
-def existing(path: Any, suffix: str = "zip") -> Any:
-    """:return: the path with the suffix, where SB3 would look for it; a file as it is"""
+def existing(path: Any) -> Any:
+    """:return: the path, with ``.zip`` where it does not exist without; an open file unchanged"""
     if not isinstance(path, str | os.PathLike):
         return path
     named = Path(path)
-    return named if named.exists() else named.with_name(f"{named.name}.{suffix}")
+    return named if named.exists() else named.with_name(f"{named.name}.zip")
 
 
 def _opened(path: Any) -> contextlib.AbstractContextManager[Any]:
@@ -126,7 +123,7 @@ def _opened(path: Any) -> contextlib.AbstractContextManager[Any]:
 @contextlib.contextmanager
 def damage_reported(path: Any) -> Iterator[None]:
     """
-    :raises ValueError: where SB3 takes a file that misses some parts for an old one of its own
+    :raises ValueError: for errors that SB3 raises for damaged files and files that lack a part
     """
     try:
         yield
@@ -145,18 +142,18 @@ def damage_reported(path: Any) -> Iterator[None]:
 
 
 def to_state_dict(tree: Any) -> dict[str, th.Tensor]:
-    """:return: one tensor for each leaf, under its path in the pytree, in the leaves' order"""
+    """:return: one tensor for each leaf, by its path in the pytree, in the order of the leaves"""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {_name(path): th.as_tensor(np.array(leaf)) for path, leaf in leaves}
 
 
 def from_state_dict(tree: Any, tensors: dict[str, th.Tensor], strict: bool = True) -> Any:
     """
-    :param tree: a pytree of the wanted structure; gives shapes and dtypes
+    :param tree: a pytree that gives structure, shapes and dtypes
     :param tensors: what :func:`to_state_dict` made of such a pytree
     :param strict: whether names must match exactly; otherwise missing leaves keep their value
-    :return: the pytree with the tensors' values, on the devices where its leaves are
-    :raises RuntimeError: for missing or unexpected names, or another shape; as torch does
+    :return: the pytree with the tensors' values, on the devices of its leaves
+    :raises RuntimeError: for missing or unexpected names, or another shape, as in torch
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(tree)
     expected = {_name(path): leaf for path, leaf in leaves}
@@ -178,31 +175,13 @@ def from_state_dict(tree: Any, tensors: dict[str, th.Tensor], strict: bool = Tru
     return jax.tree_util.tree_unflatten(structure, values)
 
 
-def by_names(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Files hold arguments, too, and a function of JAX is pickled by parts of JAX that change.
-
-    :return: the same, with the names of activations and optimisers where their functions were
-        given, and lists where arrays were, whose truth SB3 asks for
-    """
-    named = dict(policy_kwargs)
-    for argument, value in policy_kwargs.items():
-        if isinstance(value, np.ndarray):
-            named[argument] = value.tolist()
-        elif argument.endswith("activation_fn"):
-            named[argument] = activation_name(value)
-        elif argument == "optimizer_class":
-            named[argument] = optimizer_name(value)
-    return named
-
-
 def _remove(file: Path) -> None:
     with contextlib.suppress(OSError):
         file.unlink()
 
 
 def _where(leaf: Any, value: Any) -> Any:
-    """:return: the value, where the leaf is and of its type"""
+    """:return: the value with the leaf's dtype, on the leaf's device"""
     if isinstance(leaf, np.ndarray):
         return value
     if isinstance(leaf, jax.Array) and leaf.committed:

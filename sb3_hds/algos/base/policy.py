@@ -1,8 +1,8 @@
-"""What all policies share: prediction, weights as tensors, and what updates change."""
+"""What all policies share: prediction, weights and training state, both saved as tensors."""
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import jax
@@ -16,20 +16,20 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import get_device, is_vectorized_observation
 
 from sb3_hds.algos.base.files import (
-    by_names,
     damage_reported,
     from_state_dict,
     refuse_damaged,
     to_state_dict,
 )
-from sb3_hds.algos.nets.options import TrainState
+from sb3_hds.algos.nets.observations import flattener
+from sb3_hds.algos.nets.options import TrainState, by_names, widths
 from sb3_hds.core.numerics.compilation import GENERATOR
 
 
-def refuse_odd(observation: Any) -> None:
+def check_observation(observation: Any) -> None:
     """
-    :raises ValueError: for what ``reset`` returns beside an observation, and for one that is not
-        finite
+    :raises ValueError: for the tuple that ``reset`` returns, anything that is not numeric, and
+        observations that are not finite
     """
     if isinstance(observation, tuple) and len(observation) == 2:
         raise ValueError(
@@ -53,11 +53,11 @@ def refuse_odd(observation: Any) -> None:
 @dataclasses.dataclass(frozen=True, eq=False)
 class PolicyConfig:
     """
-    What SB3 passes to every policy.
+    Arguments that SB3 passes to every policy.
 
     :param observation_space: of the environment
     :param action_space: a bounded Box
-    :param lr_schedule: learning rate by remaining progress
+    :param lr_schedule: maps the remaining progress to the learning rate
     """
 
     observation_space: spaces.Space
@@ -72,15 +72,29 @@ class PolicyConfig:
 
 class TensorPolicy(BasePolicy):
     """
-    A policy whose networks are pytrees, saved as tensors. It extends SB3's base class, not SBX's:
-    that one imports TensorFlow Probability, which nothing here needs.
+    A policy whose networks are pytrees, saved as tensors. It extends SB3's base class, not SBX's,
+    which imports TensorFlow Probability.
 
-    Subclasses implement ``weights`` and ``training_state``, each with a setter, and keep what they
-    were made with in ``arguments``.
+    Subclasses implement ``weights`` and ``training_state``, each with a setter, and store the
+    arguments of their constructor in ``arguments``.
     """
 
-    #: of the constructor, but for the spaces
+    #: arguments of the constructor without the spaces
     arguments: dict[str, Any]
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
+
+    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
+        return self._predict(obs, deterministic)  # type: ignore[return-value]
+
+    def reset_noise(self, batch_size: int = 1) -> None:
+        """
+        Draw exploration noise again, if the policy has any that lasts several steps.
+
+        :param batch_size: number of environments
+        """
 
     def predict(  # type: ignore[override]
         self,
@@ -95,15 +109,11 @@ class TensorPolicy(BasePolicy):
         :raises ValueError: if the observation has another shape than the observation space, or is
             not finite
         """
-        refuse_odd(observation)
+        check_observation(observation)
         batch, vectorized = self.prepare_obs(observation)
-        actions = np.array(self._predict(batch, deterministic=deterministic))
-        actions = actions.reshape(-1, *self.action_space.shape)  # type: ignore[misc]
-        if self.squash_output:
-            actions = self.unscale_action(np.clip(actions, -1.0, 1.0))
-        else:
-            space: Any = self.action_space
-            actions = np.clip(actions, space.low, space.high)
+        scaled = np.array(self._predict(batch, deterministic=deterministic))
+        scaled = scaled.reshape(-1, *self.action_space.shape)  # type: ignore[misc]
+        actions = self.unscale_action(np.clip(scaled, -1.0, 1.0))
         return actions if vectorized else actions.squeeze(axis=0), state
 
     def prepare_obs(self, observation: Any) -> tuple[Any, bool]:
@@ -116,16 +126,16 @@ class TensorPolicy(BasePolicy):
         return rows.reshape(-1, *space.shape), vectorized  # type: ignore[misc]
 
     def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
-        """Rounding may lead out of the bounds, by one unit in the last place."""
+        """SB3's, clipped: rounding may leave the bounds by one unit in the last place."""
         low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
         return np.clip(super().unscale_action(scaled_action), low, high)
 
     def set_up(self) -> None:
-        """The end of every constructor: networks are drawn when they are first asked for."""
+        """Nothing to do at the end of the constructor: networks are initialised on first use."""
 
     def move_to(self, device: Any) -> None:
         """
-        Nothing to move: its numbers are on the host.
+        Move the networks, if there are any.
 
         :param device: of JAX
         """
@@ -141,7 +151,7 @@ class TensorPolicy(BasePolicy):
 
     @property
     def training_state(self) -> Any:
-        """What only training needs: optimiser states, counters, random keys as integers."""
+        """The pytree that only training needs: optimiser states, counters, random keys."""
         raise AttributeError("training_state")
 
     @training_state.setter
@@ -149,19 +159,19 @@ class TensorPolicy(BasePolicy):
         raise AttributeError("training_state")
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        """What ``save`` keeps of the policy besides its weights, and ``load`` makes it from."""
+        """The arguments that ``save`` stores beside the weights and ``load`` constructs with."""
         spaces_and_more = super()._get_constructor_parameters()
         spaces_and_more.pop("normalize_images")
         arguments = by_names(self.arguments)
         if "lr_schedule" in arguments:
-            # As in SB3: acting needs no schedule, and a user's function may not be picklable.
+            # As in SB3: prediction needs no schedule, and a user's function may not be picklable.
             arguments["lr_schedule"] = self._dummy_schedule
         return spaces_and_more | arguments
 
     @classmethod
     def load(cls, path: str, device: Any = "auto") -> Self:
         """
-        SB3's ``load`` of a policy alone, which unpickles: load what you have saved yourself.
+        SB3's ``load`` of a policy alone. It unpickles: load only files that you saved yourself.
 
         :param path: of a file that ``save`` of a policy wrote
         :param device: as in SB3
@@ -169,7 +179,7 @@ class TensorPolicy(BasePolicy):
         """
         refuse_damaged(path)
         with damage_reported(path):
-            # As SB3 says, spaces are no tensors.
+            # As in SB3: spaces are no tensors.
             saved = th.load(path, map_location="cpu", weights_only=False)
         policy = cls(**saved["data"])
         policy.load_state_dict(saved["state_dict"])
@@ -185,7 +195,7 @@ class TensorPolicy(BasePolicy):
 
 class TrainingTensors:
     """
-    What SB3 takes for the optimiser of a policy: it has ``state_dict`` and ``load_state_dict``.
+    Training state of a policy as SB3 saves it: in place of an optimiser, by its ``state_dict``.
 
     :param policy: whose training state is saved
     """
@@ -204,58 +214,64 @@ class TrainingTensors:
 
 class LearningPolicy(TensorPolicy):
     """
-    Abstract: a policy that holds a state, a named tuple of networks with their optimisers
-    (:class:`~sb3_hds.algos.nets.options.TrainState`), a random ``key``, and more.
+    Abstract: a policy with a state that updates change, a named tuple of networks with their
+    optimisers (:class:`~sb3_hds.algos.nets.options.TrainState`), a random ``key``, and more.
     """
 
-    #: fields of the state that are saved with the networks, not with their optimisers
-    held: ClassVar[tuple[str, ...]]
+    #: further fields of the state that are saved with the weights, not with the training state
+    saved_with_weights: ClassVar[tuple[str, ...]]
     #: hidden widths of the actor and of the critics
     widths: tuple[tuple[int, ...], tuple[int, ...]]
     #: width of critics that a CPU can train
     narrow: ClassVar[int] = 256
-    #: observations to rows of numbers
+    #: maps observations to rows of numbers
     flatten: Callable[[Any], np.ndarray]
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(self, config: Any) -> None:
+        """:param config: a :class:`PolicyConfig` with a ``net_arch``"""
+        super().__init__(config.observation_space, config.action_space, squash_output=True)
+        self.arguments, net = config.arguments(), config.net_arch
+        self.arguments["net_arch"] = dict(net) if isinstance(net, Mapping) else net
+        self.widths = widths(net, "qf")
+        self.n_obs = spaces.flatdim(config.observation_space)
+        self.n_act = int(np.prod(config.action_space.shape))
+        self.flatten = flattener(config.observation_space)
         self._agent_state: Any = None
-        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
 
     @abstractmethod
-    def build_plain(self) -> None:
-        """Draw networks for a policy that no algorithm has built."""
+    def build_default(self) -> None:
+        """Initialise networks for a policy that is used without an algorithm."""
 
     @abstractmethod
     def critic(self, obs: Any, actions: Any) -> tuple[np.ndarray, ...]:
         """
-        As ``model.critic`` of SB3, to look at values.
+        Q-values, as ``model.critic`` of SB3.
 
-        :param obs: with a leading axis, as the environment gives them
+        :param obs: with a leading axis, as the environment returns them
         :param actions: within [-1, 1], shape ``(n, act)``
-        :return: of each critic, shape ``(n, 1)``; the mean, where it has quantiles
+        :return: of each critic, shape ``(n, 1)``; the mean over quantiles, if it has several
         """
 
     def set_random_seed(self, seed: int) -> None:
         """Reset the random key of updates and of exploratory actions."""
-        # Networks of this seed were drawn by the key that is folded here.
+        # Networks of this seed were initialised with the unfolded key.
         key = jax.random.fold_in(jax.random.key(seed, impl=GENERATOR), 1)
         placed = jax.device_put(key, self.agent_state.key.sharding)
         self.agent_state = self.agent_state._replace(key=placed)
 
-    def forget_noise(self) -> None:
-        """Draw exploration noise that lasts several steps again, where there is some."""
+    def discard_noise(self) -> None:
+        """Discard exploration noise that lasts several steps, if there is any."""
 
     @property
     def actor(self) -> "LearningPolicy":
-        """Where SB3 has the actor apart: here, it is the policy."""
+        """The policy itself, where SB3 has a separate actor."""
         return self
 
     @property
     def agent_state(self) -> Any:
-        """What updates change."""
+        """The state that updates change."""
         if self._agent_state is None:
-            self.build_plain()
+            self.build_default()
         return self._agent_state
 
     @agent_state.setter
@@ -282,18 +298,15 @@ class LearningPolicy(TensorPolicy):
             raise ValueError(f"predict() got different numbers of observations ({numbers}).")
         return rows, vectorized
 
-    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
-        return self._predict(obs, deterministic)  # type: ignore[return-value]
-
     @property
     def weights(self) -> Any:
         fields = self.agent_state._asdict()
         networks = {n: part.weights for n, part in fields.items() if isinstance(part, TrainState)}
-        return networks | {name: fields[name] for name in self.held}
+        return networks | {name: fields[name] for name in self.saved_with_weights}
 
     @weights.setter
     def weights(self, tree: Any) -> None:
-        self._take("weights", tree)
+        self._replace_parts("weights", tree)
 
     @property
     def training_state(self) -> Any:
@@ -302,7 +315,7 @@ class LearningPolicy(TensorPolicy):
         state = {
             name: part.optimizer if isinstance(part, TrainState) else part
             for name, part in fields.items()
-            if name not in self.held
+            if name not in self.saved_with_weights
         }
         return state | {"key": np.asarray(jax.random.key_data(fields["key"]), np.int64)}
 
@@ -311,9 +324,9 @@ class LearningPolicy(TensorPolicy):
         data = jnp.asarray(np.asarray(tree["key"]).astype(np.uint32))
         key = jax.random.wrap_key_data(data, impl=GENERATOR)
         placed = jax.device_put(key, self.agent_state.key.sharding)
-        self._take("optimizer", tree | {"key": placed})
+        self._replace_parts("optimizer", tree | {"key": placed})
 
-    def _take(self, of_networks: str, tree: Any) -> None:
+    def _replace_parts(self, of_networks: str, tree: Any) -> None:
         before = self.agent_state._asdict()
         after = {
             name: before[name]._replace(**{of_networks: part})

@@ -1,8 +1,8 @@
 """
-A policy from a file that a stranger sent: nothing in it is unpickled.
+Loading a policy from an untrusted file: nothing is unpickled.
 
-SB3 pickles whatever of a model is not JSON, its spaces among it, so that loading a model runs code
-of whoever saved it. Beside that, our models describe their policy in plain JSON; the weights are
+SB3 pickles the parts of a model that are not JSON, such as its spaces, so that loading a model may
+run code of whoever saved it. Our models also describe their policy in plain JSON; the weights are
 tensors, which ``torch.load(weights_only=True)`` reads.
 """
 
@@ -17,26 +17,27 @@ import jax
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_hds.algos import registry
 from sb3_hds.algos.base.files import damaged, existing, name_of, refuse_damaged
 from sb3_hds.algos.base.policy import TensorPolicy
-from sb3_hds.algos.nets.options import activation, activation_name
+from sb3_hds.algos.nets.options import ACTIVATIONS, activation, name_in
 
-# Arguments of policies that prediction does not need: they say how to learn.
+# Arguments of policies that only learning needs.
 _OF_LEARNING = ("lr_schedule", "optimizer_class", "optimizer_kwargs", "qf_optimizer_kwargs")
 
 
 def described(policy: TensorPolicy) -> dict[str, Any] | None:
     """
-    :return: plain data from which ``load_policy`` builds the policy, without its weights; None for
-        a class, a space or an activation that only Python knows
+    :return: JSON data from which ``load_policy`` builds the policy, without its weights; None for a
+        class, a space or an activation that JSON cannot name
     """
     name = registry.registered_name(type(policy))
     if name is None:
         return None
     arguments = {
-        name: activation_name(activation(value)) if name.endswith("activation_fn") else value
+        name: name_in(ACTIVATIONS, activation(value)) if name.endswith("activation_fn") else value
         for name, value in policy.arguments.items()
         if name not in _OF_LEARNING
     }
@@ -92,14 +93,14 @@ def space_from_plain(plain: Mapping[str, Any]) -> spaces.Space:
             return spaces.MultiBinary(plain["n"])
         case "Dict":
             parts = {name: space_from_plain(part) for name, part in plain["spaces"].items()}
-            # Sorted names would be another order of a flat observation.
+            # A dictionary would be sorted, which reorders the flat observation.
             return spaces.Dict(list(parts.items()))  # type: ignore[arg-type]
     raise KeyError(plain["kind"])
 
 
 def _plain(value: Any) -> Any:
     """
-    :return: a number or an array of NumPy as Python has it
+    :return: a NumPy number or array as a Python number or list
     :raises TypeError: for anything else
     """
     if isinstance(value, np.generic | np.ndarray):
@@ -109,25 +110,25 @@ def _plain(value: Any) -> Any:
 
 def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolicy:
     """
-    The policy of a saved model, on the CPU, to act with: ``policy.predict(obs,
+    Load the policy of a saved model on the CPU, to act with ``policy.predict(obs,
     deterministic=True)``.
 
-    Nothing is unpickled: the file may come from anywhere. It has no environment, no
-    ``VecNormalize`` (whose statistics are a file of their own) and cannot go on learning. That of
-    BRO draws from its plain actor with ``deterministic=False``, not from the optimistic one.
+    Nothing is unpickled, so the file need not be trusted. The policy has no environment and no
+    ``VecNormalize`` (whose statistics are a separate file), and cannot continue learning. With
+    ``deterministic=False``, BRO's policy draws from its actor, not from the optimistic one.
 
     :param path: of a zip file that one of our algorithms saved; ``.zip`` may be left out
-    :return: a policy with ``predict``, and no optimiser
-    :raises FileNotFoundError: if there is none
-    :raises ValueError: for a file that is damaged, that another library saved, or whose policy only
-        Python code describes: a class or an activation function of your own
+    :return: a policy with ``predict``, without an optimiser
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: for a file that is damaged, that another library saved, or whose policy has
+        a class or an activation function of your own
     """
     refuse_damaged(path, "data", "policy.pth")
     with zipfile.ZipFile(existing(path)) as file:
         content, tensors = file.read("data"), io.BytesIO(file.read("policy.pth"))
     try:
         description = json.loads(content).get("policy_description")
-    # Whatever a stranger wrote there, however deep it is nested.
+    # An untrusted file may hold anything, nested to any depth.
     except (AttributeError, ValueError, RecursionError) as error:
         raise damaged(path, error) from error
     if description is None:
@@ -140,7 +141,7 @@ def load_policy(path: str | os.PathLike[str] | io.BufferedIOBase) -> TensorPolic
     policy.move_to(_cpu())
     try:
         policy.load_state_dict(th.load(tensors, map_location="cpu", weights_only=True))
-    # What torch raises for a damaged file has many types, and recommends to unpickle it.
+    # For a damaged file, torch raises many types of errors, some of which recommend unpickling.
     except Exception as error:
         raise ValueError(
             f"{name_of(path)} has weights that are damaged, or do not fit the policy that it "
@@ -155,8 +156,9 @@ def _built(description: Mapping[str, Any]) -> TensorPolicy:
         observation_space = space_from_plain(description["observation_space"])
         action_space: Any = space_from_plain(description["action_space"])
         arguments = description["arguments"]
-        policy = make(observation_space, action_space, lr_schedule=_no_rate, **arguments)  # type: ignore[call-arg]
-    # Whatever a constructor makes of numbers that a stranger wrote.
+        no_rate = FloatSchedule(0.0)
+        policy = make(observation_space, action_space, lr_schedule=no_rate, **arguments)  # type: ignore[call-arg]
+    # With arguments of an untrusted file, a constructor may raise anything.
     except Exception as error:
         raise ValueError(
             f"This file describes its policy in a way that this version does not know "
@@ -166,12 +168,8 @@ def _built(description: Mapping[str, Any]) -> TensorPolicy:
 
 
 def _cpu() -> Any:
-    """:return: where ``JAX_PLATFORMS`` leaves out the CPU, the first device that there is"""
+    """:return: the CPU, or the first device if ``JAX_PLATFORMS`` excludes the CPU"""
     try:
         return jax.devices("cpu")[0]
     except RuntimeError:
         return jax.devices()[0]
-
-
-def _no_rate(_: float) -> float:
-    return 0.0

@@ -1,4 +1,4 @@
-"""Saving and loading of every algorithm: tensors, in files that are whole or not there."""
+"""Construction, saving and loading of every algorithm; weights are saved as tensors."""
 
 import contextlib
 import inspect
@@ -20,13 +20,14 @@ from sb3_hds.algos.base.construct import (
     callbacks_of,
     check_has_env,
     checked_env,
+    checked_timesteps,
     device_or_cpu,
     in_one_line,
     policy_and_env,
-    whole_steps,
 )
-from sb3_hds.algos.base.files import by_names, damage_reported, name_of, refuse_damaged, write_whole
+from sb3_hds.algos.base.files import damage_reported, name_of, refuse_damaged, write_whole
 from sb3_hds.algos.base.policy_file import described
+from sb3_hds.algos.nets.options import by_names
 from sb3_hds.core.numerics.compilation import keep_programs
 from sb3_hds.errors import EnvironmentMismatchError
 
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 @contextlib.contextmanager
 def _space_mismatch_reported() -> Iterator[None]:
     """
-    :raises EnvironmentMismatchError: where SB3 finds other spaces, in one line
+    :raises EnvironmentMismatchError: where SB3 finds that spaces do not match
     """
     try:
         yield
@@ -51,7 +52,7 @@ def _space_mismatch_reported() -> Iterator[None]:
 
 
 class _ByName:
-    """A policy class that a model holds, and saves, by its name in the registry if it has one."""
+    """The policy class of a model, stored and saved by its name in the registry if it has one."""
 
     def __get__(self, model: Any, owner: type | None = None) -> Any:
         if model is None:
@@ -76,19 +77,18 @@ class SavesTensors(BaseAlgorithm):
 
     def construct(self, config: Config, **more: Any) -> None:
         """
-        Call SB3's constructor with what it takes of the arguments, and keep the others as
-        attributes.
+        Pass on the arguments that SB3's constructor takes, and store the others as attributes.
 
-        :param more: arguments of SB3's constructor that are not the user's to choose
+        :param more: fixed arguments of SB3's constructor
         """
         keep_programs()
         policy, env = policy_and_env(
             type(self), config.policy, config.env, self.check_observations, config.monitor_wrapper
         )
-        # Python's own generator, which SB3 seeds as well, takes no number of NumPy.
+        # SB3 seeds Python's generator, too, which takes no NumPy integer.
         seed = None if config.seed is None else int(config.seed)
         own: dict[str, Any] = {name: getattr(config, name) for name in arguments_of(config)}
-        # SB3 and SBX write into dictionaries: two models that were given the same are still two.
+        # SB3 and SBX write into dictionaries, which several models may have been given.
         own = {name: dict(x) if isinstance(x, dict) else x for name, x in own.items()}
         own |= {"policy": policy, "env": env, "seed": seed}
         del own["device"]  # of torch, where SB3 has one
@@ -101,9 +101,9 @@ class SavesTensors(BaseAlgorithm):
 
     def set_up(self) -> None:
         """
-        The end of every constructor; ``load`` sets the model up later.
+        Make networks and buffers, at the end of every constructor and of ``load``.
 
-        :raises ValueError: if there is no environment to make networks for
+        :raises ValueError: without an environment
         """
         if self.env is None:
             name = type(self).__name__
@@ -112,7 +112,7 @@ class SavesTensors(BaseAlgorithm):
 
     @property
     def config(self) -> Any:
-        """The arguments as the model's attributes have them now."""
+        """The current values of the arguments."""
         return self.config_class.of(self)
 
     @staticmethod
@@ -128,12 +128,12 @@ class SavesTensors(BaseAlgorithm):
         include: Iterable[str] | None = None,
     ) -> None:
         """
-        Write a zip file as SB3 does, whole or not at all.
+        Write a zip file as SB3 does, atomically.
 
         :param path: of the file; ``.zip`` is appended where it has no suffix
-        :param exclude: attributes to leave out besides the usual ones
-        :param include: attributes to write although they are usually left out
-        :raises OSError: if the file cannot be written; an older one is then left as it was
+        :param exclude: attributes to leave out besides the default ones
+        :param include: attributes to write although they are left out by default
+        :raises OSError: if the file cannot be written; an older file is then unchanged
         :raises DivergedError: for weights that are not finite
         """
         self.check_weights()
@@ -143,13 +143,13 @@ class SavesTensors(BaseAlgorithm):
 
     def export_onnx(self, path: str | os.PathLike[str], **options: Any) -> "Exported":
         """
-        Write what the policy computes where nothing is explored as an ONNX file, which
-        :class:`~sb3_hds.deploy.OnnxPolicy` and every other runtime of ONNX runs.
+        Export the deterministic policy as an ONNX file, which :class:`~sb3_hds.deploy.OnnxPolicy`
+        and every other ONNX runtime runs.
 
-        :param path: a file of that name is replaced
+        :param path: an existing file is replaced
         :param options: see :func:`~sb3_hds.deploy.export_onnx`
-        :return: what was written
-        :raises ExportError: where the file would compute something else
+        :return: description of the file
+        :raises ExportError: if the file would not compute the same actions
         """
         from sb3_hds.deploy import export_onnx
 
@@ -168,10 +168,10 @@ class SavesTensors(BaseAlgorithm):
         SB3's ``load``.
 
         :param path: of a file that this class saved
-        :param env: to go on training in; none is needed to predict
-        :param device: where to; ``"cuda"`` means the CPU where there is none, with a warning
+        :param env: to continue training in; not needed for prediction
+        :param device: of the weights; ``"cuda"`` falls back to the CPU with a warning
         :raises ValueError: for a damaged file, or one that another algorithm saved
-        :raises TypeError: for an argument that neither this nor the constructor has
+        :raises TypeError: for an argument that neither ``load`` nor the constructor has
         """
         check_known(cls, cls.config_class, kwargs, loading=True)
         env = None if env is None else checked_env(cls, env)
@@ -185,9 +185,9 @@ class SavesTensors(BaseAlgorithm):
         """
         SB3's ``set_env``.
 
-        :param env: with the spaces of the one before, or its id
-        :param force_reset: False goes on from where the environment is
-        :raises EnvironmentMismatchError: for one with other spaces, and for what is none
+        :param env: an environment with the same spaces, or its id
+        :param force_reset: False continues from the environment's current state
+        :raises EnvironmentMismatchError: unless it is an environment with the same spaces
         """
         with _space_mismatch_reported():
             super().set_env(checked_env(type(self), env), force_reset)
@@ -196,18 +196,18 @@ class SavesTensors(BaseAlgorithm):
         self, total_timesteps: int, *args: Any, **kwargs: Any
     ) -> tuple[int, BaseCallback]:
         check_has_env(self)
-        return super()._setup_learn(whole_steps(total_timesteps), *args, **kwargs)
+        return super()._setup_learn(checked_timesteps(total_timesteps), *args, **kwargs)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         return super()._init_callback(callbacks_of(callback), progress_bar)  # type: ignore[arg-type]
 
     def check_weights(self) -> None:
         """
-        :raises DivergedError: for weights that are not finite, of algorithms that may have some
+        :raises DivergedError: for weights that are not finite; some algorithms cannot have any
         """
 
     def get_parameters(self) -> dict[str, dict]:
-        """:return: by the object's name its tensors by theirs; objects that have some"""
+        """:return: tensors by object and name; objects without tensors are left out"""
         return {name: tensors for name, tensors in super().get_parameters().items() if tensors}
 
     def set_parameters(
@@ -219,12 +219,11 @@ class SavesTensors(BaseAlgorithm):
         """
         SB3's ``set_parameters``.
 
-        :param load_path_or_dict: of a file, or what ``get_parameters`` returned
-        :param exact_match: whether nothing may be missing
-        :param device: where to
-        :raises ValueError: for names of objects that this model does not have, or has and misses,
-            and for a damaged file
-        :raises RuntimeError: for tensors that do not fit
+        :param load_path_or_dict: path of a file, or the result of ``get_parameters``
+        :param exact_match: whether all objects must be given
+        :param device: of the tensors
+        :raises ValueError: for unknown or missing names of objects, and for a damaged file
+        :raises RuntimeError: for tensors of other names or shapes
         """
         given = load_path_or_dict
         if not isinstance(given, dict):

@@ -1,4 +1,4 @@
-"""Training in a thread of its own, beside a control loop that must not wait."""
+"""Training in a separate thread, beside a control loop that must not wait."""
 
 import threading
 
@@ -8,17 +8,16 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 class TrainBeside(BaseCallback):
     """
-    Trains an off-policy algorithm in another thread while its environment runs.
+    Train an off-policy algorithm in another thread while its environment runs.
 
-    The policy that acts is whatever has been learned so far. Construct the algorithm with
-    ``gradient_steps=0``, so that it does not train in the loop, too. Once the replay buffer is
-    full, a transition that is drawn while it is overwritten may be half old, half new: choose a
-    ``buffer_size`` that is not reached. For the model-free algorithms of this package and of SBX,
-    whose weights are exchanged as a whole; those of SB3 change theirs in place.
+    The latest policy acts. Construct the algorithm with ``gradient_steps=0``, so that it does not
+    train in the loop, too. Once the replay buffer is full, a transition that is sampled while it is
+    overwritten may mix two transitions: choose a ``buffer_size`` that is not reached. This is for
+    the model-free algorithms of this package and of SBX, which replace all weights at once; those
+    of SB3 change them in place.
 
-    :param gradient_steps: in a row, before the newest transitions are looked at again
-    :param most: gradient steps per transition that are never exceeded; None: as many as there is
-        time for
+    :param gradient_steps: gradient steps per call of ``train``
+    :param most: largest number of gradient steps per transition; None: no limit
     :raises ValueError: if the algorithm trains in the loop, or has no replay buffer
     """
 
@@ -52,7 +51,7 @@ class TrainBeside(BaseCallback):
             raise self._error
 
     def stop(self) -> None:
-        """End the thread. ``learn`` does so when it ends; call it where that was broken off."""
+        """End the thread, as ``learn`` does at its end; call it after an interrupted ``learn``."""
         self._stopped.set()
         if self._thread is not None:
             self._thread.join()

@@ -1,4 +1,4 @@
-"""What model-free algorithms share: SB3 collects steps and calls ``train``, which updates."""
+"""What model-free algorithms share: SB3 collects steps and calls ``train``."""
 
 import dataclasses
 import itertools
@@ -30,10 +30,10 @@ from sb3_hds.algos.nets.observations import check_actions, check_observations
 from sb3_hds.algos.nets.options import TrainState, finite_leaves
 from sb3_hds.errors import DivergedError, EnvironmentMismatchError
 
-# What is logged of updates of the actor, which not every call of ``train`` makes.
+# Logged by updates of the actor, which not every call of ``train`` makes.
 _OF_ACTOR = ("actor_loss", "ent_coef", "ent_coef_loss")
 _USUAL_BATCH = 256
-# What networks compute in.
+# Largest number of the precision in which networks compute.
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -46,29 +46,30 @@ class ModelFreeConfig(OffPolicyConfig):
         (not CrossQ, TD7 and BRO), a policy class, or the environment itself
     :param learning_rate: of the actor, the entropy coefficient and the critics; number, schedule or
         ``"lin_3e-4"``
-    :param qf_learning_rate: of the critics, where it differs
-    :param learning_starts: steps with random actions before learning starts; where a paper has
-        more (DroQ, CrossQ and SimBa 5,000, BRO 2,500), the files in ``hyperparams/`` have as many
-        on the tasks of that paper
+    :param qf_learning_rate: of the critics; None: ``learning_rate``
+    :param learning_starts: steps with random actions before learning starts; the files in
+        ``hyperparams/`` have the papers' values for the papers' tasks (DroQ, CrossQ and SimBa
+        5,000, BRO 2,500)
     :param batch_size: transitions per update
     :param tau: weight of the online critics in the Polyak average of the target critics
-    :param gradient_steps: updates per call of ``train``; -1: as many as steps were made
-    :param policy_delay: updates of the critics for each of the actor
+    :param gradient_steps: updates per call of ``train``; -1: one per environment step since the
+        last call
+    :param policy_delay: updates of the critics per update of the actor
     :param replay_buffer_class: as in SB3
     :param replay_buffer_kwargs: as in SB3
     :param optimize_memory_usage: as in SB3; needs
         ``replay_buffer_kwargs={"handle_timeout_termination": False}``
-    :param n_steps: of the returns that critics are regressed on; above 1, neither with Dict
-        observations nor with ``optimize_memory_usage``
+    :param n_steps: of n-step returns; above 1 neither with Dict observations nor with
+        ``optimize_memory_usage``
     :param use_sde: explore by gSDE instead of independent noise at each step; not with TD7, which
         adds noise to its actions
-    :param sde_sample_freq: steps between two draws of its noise matrix, however many collections
-        (``train_freq``) they take, where SB3 draws in each; -1: at the start of each collection.
-        Where collections are episodes, each starts with a new one
-    :param use_sde_at_warmup: whether it also acts before ``learning_starts``
+    :param sde_sample_freq: steps between two draws of the noise matrix, across collections
+        (``train_freq``), whereas SB3 draws in each; -1: at the start of each collection. If
+        collections are episodes, each starts with a new matrix.
+    :param use_sde_at_warmup: whether gSDE also acts before ``learning_starts``
     :param policy_kwargs: see :class:`~sb3_hds.algos.GaussianPolicy`
     :param param_resets: steps of the environment at which networks and their optimisers are reset;
-        the entropy coefficient stays, except with BRO, and so does TD7's checkpoint
+        the entropy coefficient (except with BRO) and TD7's checkpoint are kept
     """
 
     _: KW_ONLY
@@ -126,13 +127,15 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     #: steps of ``learn()`` without a number
     default_timesteps: ClassVar[int] = 20_000
     policy: LearningPolicy
+    #: fields of the policy's state that ``param_resets`` leaves unchanged
+    kept_by_restarts: Any
     qf_learning_rate: Any
     policy_delay: int
-    #: the replay buffer that arguments led to, where none was passed
+    #: class of the replay buffer that was derived from arguments, if none was passed
     _derived_buffer: type[ReplayBuffer] | None = None
     #: the state before the last update
     _before: Any = None
-    #: the ``param_resets`` that ``reset_idx`` counts in
+    #: the ``param_resets`` that ``reset_idx`` counts
     _counted_resets: list[int] | None = None
 
     def construct(self, config: ModelFreeConfig, **more: Any) -> None:  # type: ignore[override]
@@ -152,8 +155,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
-        As in SB3; the random keys of updates and policies, which are the model's own, are reset,
-        too.
+        SB3's ``set_random_seed``, which also resets the random keys of updates and policies.
 
         :param seed: None: nothing changes
         """
@@ -163,29 +165,35 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     @abstractmethod
     def _build(self, seed: int) -> None:
-        """Draw fresh networks."""
+        """Initialise the networks."""
 
-    @abstractmethod
     def _restart(self, seed: int) -> None:
-        """Draw fresh networks, and keep what is no network."""
+        """Initialise the networks anew; the fields in ``kept_by_restarts`` stay."""
+        before = self.policy.agent_state
+        kept = {name: getattr(before, name) for name in self.kept_by_restarts}
+        self._build(seed)
+        self.policy.agent_state = self.policy.agent_state._replace(**kept)
 
     @abstractmethod
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
         """
-        :param n: of the critics
-        :return: by name, what is logged: of the last one; the actor's of its last one among them
+        :param n: updates of the critics
+        :return: metrics of the last update by name, those of the actor of its own last update
         """
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """
-        Updates on what the replay buffer holds.
+        Make updates on batches from the replay buffer.
 
-        :param gradient_steps: how many
-        :param batch_size: transitions in each
-        :raises DivergedError: if one of them diverged; the model keeps its last good state
-        :raises ValueError: if there is nothing to learn from
+        :param gradient_steps: number of updates
+        :param batch_size: transitions per update
+        :raises DivergedError: if an update diverged; the model keeps its last finite state
+        :raises ValueError: if the replay buffer is empty
         """
-        self._maybe_reset_params()
+        resets = self.param_resets or []
+        if self.reset_idx < len(resets) and self.num_timesteps >= resets[self.reset_idx]:
+            self.reset_idx += 1
+            self._restart(self.network_seed)
         rate, qf_rate = self.learning_rates()
         if gradient_steps > 0 and self.replay_buffer.size() == 0:  # type: ignore[union-attr]
             raise ValueError(
@@ -196,7 +204,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         try:
             report = self._updates(gradient_steps, batch_size)
         finally:
-            # Interrupted, some of them were made.
+            # Also after an interrupt, when some of the updates were made.
             now = int(self.policy.agent_state.n_updates)
             self._n_updates += now - before
         improved = now // self.policy_delay > before // self.policy_delay
@@ -209,15 +217,15 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             if name not in silent:
                 self.logger.record(f"train/{name}", value)
 
-    def _take(self, state: Any, report: dict[str, float]) -> None:
+    def _accept(self, state: Any, report: dict[str, float]) -> None:
         """
-        Go on with what an update made of the networks.
+        Accept the state after an update.
 
-        :param report: its losses, which show whether the networks before it are good
-        :raises DivergedError: if it diverged; the model keeps its last good state
+        :param report: losses of the update, finite if the networks before it were
+        :raises DivergedError: if it diverged; the model keeps its last finite state
         """
         if not all(map(math.isfinite, report.values())):
-            self._give_up(f"an update diverged ({report})")
+            self._raise_diverged(f"an update diverged ({report})")
         self._before, self.policy.agent_state = self.policy.agent_state, state
 
     def remedies(self, updates_per_step: float) -> list[str]:
@@ -236,13 +244,13 @@ class ModelFreeAlgorithm(TensorAlgorithm):
         return [*found, "a GPU"]
 
     def check_weights(self) -> None:
-        if not finite_leaves(_trained(self.policy.agent_state)):
-            self._give_up("an update made weights that are not finite")
+        if not finite_leaves(_train_states(self.policy.agent_state)):
+            self._raise_diverged("an update made weights that are not finite")
 
-    def _give_up(self, what: str) -> NoReturn:
-        if self._before is not None and not finite_leaves(_trained(self.policy.agent_state)):
+    def _raise_diverged(self, what: str) -> NoReturn:
+        if self._before is not None and not finite_leaves(_train_states(self.policy.agent_state)):
             self.policy.agent_state = self._before
-            self.policy.forget_noise()
+            self.policy.discard_noise()
         raise DivergedError(
             f"{type(self).__name__}: {what}. The model keeps its last good state; lower "
             "learning_rate, or scale rewards."
@@ -253,7 +261,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
     ) -> tuple[np.ndarray, np.ndarray]:
         actions = super()._sample_action(learning_starts, action_noise, n_envs)
         if not np.isfinite(actions[1]).all():
-            self._give_up("its actions are not finite")
+            self._raise_diverged("its actions are not finite")
         return actions
 
     def _setup_learn(
@@ -268,7 +276,7 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self._end_episode()
         resets = list(self.param_resets or [])
         if resets != self._counted_resets:
-            # Others than those of the model that was loaded.
+            # `load` changed them.
             self._counted_resets = resets
             self.reset_idx = sum(at <= self.num_timesteps for at in resets)
         return super()._setup_learn(
@@ -291,12 +299,12 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     @property
     def replay_source(self) -> Source:
-        """What batches are drawn from."""
+        """The replay buffer, and how batches are made of its transitions."""
         normalizer = self.get_vec_normalize_env()
         return Source(self.replay_buffer, normalizer, self.policy.flatten, self.gamma)
 
     def learning_rates(self) -> tuple[float, float]:
-        """:return: of the actor and of the critics, at this point of the training"""
+        """:return: current learning rates of the actor and of the critics"""
         rate = self._rate("learning_rate", self.lr_schedule)
         if self.qf_learning_rate is None:
             return rate, rate
@@ -304,9 +312,9 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     def _rate(self, name: str, schedule: Schedule) -> float:
         """
-        :raises ValueError: for one that is no learning rate
+        :raises ValueError: unless it is a finite number of at least 0
         """
-        # The last collection may go beyond the steps that were asked for.
+        # The last collection may exceed ``total_timesteps``.
         remaining = max(0.0, self._current_progress_remaining)
         rate = float(schedule(remaining))
         if not between(rate, 0.0, _LARGEST):
@@ -328,15 +336,15 @@ class ModelFreeAlgorithm(TensorAlgorithm):
 
     def warn_of_unused(self, config: Config, *names: str, why: str) -> None:
         """
-        :param names: of arguments that have no effect here
-        :param why: not
+        :param names: of arguments that have no effect
+        :param why: the reason, for the warning
         """
         unused = [name for name in names if not config.is_default(name)]
         if unused:
-            warnings.warn(f"{type(self).__name__} does not look at {', '.join(unused)}: {why}.")
+            warnings.warn(f"{type(self).__name__} ignores {', '.join(unused)}: {why}.")
 
     def _setup_model(self) -> None:
-        # Of None, SBX makes the first number of ``learning_rate``.
+        # SBX would replace None by the first value of ``learning_rate``.
         given, self._before = self.qf_learning_rate, None
         derived = self.replay_buffer_class in (None, self._derived_buffer)
         if derived:
@@ -348,27 +356,21 @@ class ModelFreeAlgorithm(TensorAlgorithm):
             self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
         )
         self._build(self.network_seed)
-        # SB3 draws gSDE's noise and reads its deviation from the actor.
+        # SB3 draws gSDE's noise and reads its standard deviation from the actor.
         self.actor: Any = self.policy.actor
         self.critic: Any = self.policy.critic
 
     def _derive_buffer(self) -> None:
-        """What ``load`` was passed counts, not what it read."""
+        """Derive the class again after loading: arguments of ``load`` may have changed it."""
         if self._derived_buffer is NStepReplayBuffer:
             held = self.replay_buffer_kwargs.items()
             own = {name: value for name, value in held if name not in ("n_steps", "gamma")}
             self.replay_buffer_kwargs = own
-        self.replay_buffer_class = self._usual_buffer()
+        self.replay_buffer_class = self._default_buffer()
 
-    def _usual_buffer(self) -> type[ReplayBuffer] | None:
-        """:return: what is used where none is passed; None: what SB3 uses"""
+    def _default_buffer(self) -> type[ReplayBuffer] | None:
+        """:return: the class that is used if none is passed; None: SB3's default"""
         return None
-
-    def _maybe_reset_params(self) -> None:
-        resets = self.param_resets or []
-        if self.reset_idx < len(resets) and self.num_timesteps >= resets[self.reset_idx]:
-            self.reset_idx += 1
-            self._restart(self.network_seed)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic", "_before"]
@@ -380,7 +382,7 @@ def _are_rising_steps(given: Any) -> bool:
     return all(before < after for before, after in itertools.pairwise(given))
 
 
-def _trained(state: Any) -> list[Any]:
-    """:return: all that optimisers change, with their own state"""
+def _train_states(state: Any) -> list[Any]:
+    """:return: the networks of the state with their optimisers"""
     parts = jax.tree.leaves(state, is_leaf=lambda part: isinstance(part, TrainState))
     return [part for part in parts if isinstance(part, TrainState)]

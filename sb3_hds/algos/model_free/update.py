@@ -1,4 +1,4 @@
-"""What model-free updates share: batches from SB3's replay buffers, and a schedule of steps."""
+"""What model-free updates share: batches from SB3's replay buffers, and the update schedule."""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,7 +19,7 @@ Found = TypeVar("Found")
 
 class Batch(NamedTuple):
     """
-    Transitions. ``discount`` is that of the next value: :math:`\\gamma^n` for n-step returns.
+    Transitions. ``discount`` multiplies the next value: :math:`\\gamma^n` for n-step returns.
     """
 
     obs: Float[Array, "*batch obs"]
@@ -34,8 +34,8 @@ class UpdateStep(NamedTuple):
     """
     One step of an update.
 
-    :param fields: of the state, which it changes
-    :param interval: updates from one time that it is due to the next
+    :param fields: of the state that it changes
+    :param interval: updates between two applications
     :param apply: maps the state, the metrics so far and a key to the new values of these fields and
         the new metrics
     """
@@ -47,12 +47,12 @@ class UpdateStep(NamedTuple):
 
 def apply_schedule(state: AnyState, found: Found, *steps: UpdateStep) -> tuple[AnyState, Found]:
     """
-    One update: its steps in order, each where it is due, with a random key of its own.
+    One update: apply its steps in order, each in its interval and with its own random key.
 
     :param state: has a ``key`` and counts its updates in ``n_updates``
-    :param found: metrics, or more
-    :param steps: each sees what those before it have changed
-    :return: both after an update
+    :param found: metrics, or a pytree that contains them
+    :param steps: each receives the state and the metrics that the previous ones returned
+    :return: state and metrics after the update
     """
     now: Any = state
     key, *keys = jax.random.split(now.key, 1 + len(steps))
@@ -62,7 +62,7 @@ def apply_schedule(state: AnyState, found: Found, *steps: UpdateStep) -> tuple[A
         if step.interval == 1:
             fields, found = apply()
         else:
-            # Other fields stay outside: what a branch hands through is copied.
+            # Only these fields pass through the branches, which copy their arguments.
             before = tuple(getattr(now, name) for name in step.fields), found
             due = now.n_updates % step.interval == 0
             fields, found = jax.lax.cond(due, apply, lambda before=before: before)
@@ -73,20 +73,20 @@ def apply_schedule(state: AnyState, found: Found, *steps: UpdateStep) -> tuple[A
 def zero_metrics(kind: type[AnyMetrics]) -> AnyMetrics:
     """
     :param kind: a named tuple of numbers
-    :return: one before any update
+    :return: metrics before the first update
     """
-    # Of NumPy: JAX would dispatch each as a program of its own, at every step.
+    # NumPy: JAX would dispatch a program for each of them at every step.
     zero: Any = np.zeros((), jnp.result_type(float))
     return kind._make(zero for _ in kind._fields)
 
 
 class Source(NamedTuple):
     """
-    What batches are drawn from.
+    A replay buffer, and how batches are made of its transitions.
 
     :param buffer: of SB3
     :param normalizer: the environment's ``VecNormalize``; None: it has none
-    :param flatten: observations to rows of numbers
+    :param flatten: maps observations to rows of numbers
     :param gamma: discount per step
     """
 
@@ -98,13 +98,18 @@ class Source(NamedTuple):
 
 def batches_of(source: Source, n: int, batch_size: int, capacity: int) -> Batch:
     """
-    :param n: batches that are drawn
-    :param capacity: batches of the result; those beyond ``n`` are empty
+    :param n: number of sampled batches
+    :param capacity: batches of the result; those beyond ``n`` are zero
     :return: arrays of shape ``(capacity, batch_size, ...)``
     """
     buffer = source.buffer
-    direct = type(buffer) is ReplayBuffer and not buffer.optimize_memory_usage
-    drawn = (_directly if direct else _over_torch)(source, n * batch_size)
+    if type(buffer) is ReplayBuffer and not buffer.optimize_memory_usage:
+        # Sample as ``ReplayBuffer.sample`` does, without torch.
+        size = n * batch_size
+        steps = np.random.randint(buffer.buffer_size if buffer.full else buffer.pos, size=size)
+        drawn = transitions(source, steps, np.random.randint(buffer.n_envs, size=size))
+    else:
+        drawn = _over_torch(source, n * batch_size)
     missing = (capacity - n) * batch_size
 
     def stacked(rows: np.ndarray) -> np.ndarray:
@@ -115,19 +120,11 @@ def batches_of(source: Source, n: int, batch_size: int, capacity: int) -> Batch:
     return Batch(**{name: stacked(rows) for name, rows in drawn.items()})  # type: ignore[arg-type]
 
 
-def _directly(source: Source, n: int) -> dict[str, np.ndarray]:
-    """As ``ReplayBuffer.sample`` does it."""
-    buffer = source.buffer
-    steps = np.random.randint(buffer.buffer_size if buffer.full else buffer.pos, size=n)
-    copies = np.random.randint(buffer.n_envs, size=n)
-    return transitions(source, steps, copies)
-
-
 def transitions(source: Source, steps: np.ndarray, copies: np.ndarray) -> dict[str, np.ndarray]:
     """
     :param steps: rows of the buffer, shape ``(n,)``
-    :param copies: of which environment, shape ``(n,)``
-    :return: the fields of a ``Batch``, each of ``n`` rows; a time limit is no termination
+    :param copies: number of the environment, shape ``(n,)``
+    :return: the fields of a ``Batch``, ``n`` rows each; a time limit is no termination
     """
     buffer, normalizer, flatten, gamma = source
     obs, next_obs = buffer.observations[steps, copies], buffer.next_observations[steps, copies]
@@ -148,7 +145,7 @@ def transitions(source: Source, steps: np.ndarray, copies: np.ndarray) -> dict[s
 
 def _over_torch(source: Source, n: int) -> dict[str, np.ndarray]:
     buffer, normalizer, flatten, gamma = source
-    buffer.device = th.device("cpu")  # what is drawn goes to JAX by NumPy
+    buffer.device = th.device("cpu")  # samples reach JAX through NumPy
     data = buffer.sample(n, env=normalizer)
 
     def plain(rows: Any) -> Any:

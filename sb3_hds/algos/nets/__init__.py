@@ -1,1 +1,1 @@
-"""Building blocks of networks, their optimisers, and observations as networks see them."""
+"""Activations, widths and optimisers of networks, and observations as networks see them."""

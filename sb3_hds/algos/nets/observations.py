@@ -1,7 +1,4 @@
-"""
-Observations as the networks see them: flat, numeric, and of running scale where asked for. And
-which spaces there may be.
-"""
+"""Observations as networks see them: flat, numeric, optionally normalised; supported spaces."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -20,7 +17,7 @@ class RunningStats(NamedTuple):
     """
     Running mean and variance of the observations of the environment.
 
-    :param count: how many there were; shape ``()``
+    :param count: number of observations, shape ``()``
     """
 
     mean: Float[Array, " obs"]
@@ -34,7 +31,7 @@ class RunningStats(NamedTuple):
     def with_more(self, obs: np.ndarray) -> "RunningStats":
         """
         :param obs: shape ``(n, obs)``
-        :return: as if they had been there from the start (Chan et al. 1983), on the host
+        :return: statistics with these observations included (Chan et al. 1983), on the host
         """
         n, n_more = float(self.count), len(obs)
         mean, variance = np.asarray(self.mean, np.float64), np.asarray(self.variance, np.float64)
@@ -46,7 +43,7 @@ class RunningStats(NamedTuple):
 
 
 def normalize(stats: RunningStats, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
-    """:return: observations in units of what was seen so far; before anything was, as they are"""
+    """:return: standardised observations; unchanged before two were counted"""
     known = stats.count > 1.0
     std = jnp.sqrt(jnp.where(known, stats.variance, 1.0) + _EPSILON)
     return (obs - jnp.where(known, stats.mean, 0.0)) / std
@@ -54,8 +51,8 @@ def normalize(stats: RunningStats, obs: Float[Array, "*batch obs"]) -> Float[Arr
 
 def check_observations(space: spaces.Space) -> None:
     """
-    :raises EnvironmentMismatchError: for images, for observations of nothing, and whatever else is
-        not made of numbers and choices
+    :raises EnvironmentMismatchError: for images, empty observations, and spaces other than Box,
+        Discrete, MultiDiscrete, MultiBinary and Dict of these
     """
     parts = space.spaces.items() if isinstance(space, spaces.Dict) else [("", space)]
     for name, part in parts:
@@ -84,15 +81,15 @@ def check_observations(space: spaces.Space) -> None:
                 f"{what} is a MultiDiscrete with {len(part.shape)} axes, and SB3's replay buffers "
                 "take one: gymnasium.wrappers.FlattenObservation makes numbers of it."
             )
-    if size_of(space) == 0:
+    if spaces.flatdim(space) == 0:
         raise EnvironmentMismatchError(f"The observation has no numbers ({space}).")
 
 
 def check_actions(space: spaces.Box) -> None:
     """
     :param space: with finite limits
-    :raises EnvironmentMismatchError: for integers, which SB3's replay buffers would make of actions
-        scaled to [-1, 1], and for controls that cannot be scaled
+    :raises EnvironmentMismatchError: for integers, to which SB3's replay buffers would round
+        actions scaled to [-1, 1], and for actions without a range
     """
     if not np.issubdtype(space.dtype, np.floating):
         raise EnvironmentMismatchError(
@@ -107,20 +104,15 @@ def check_actions(space: spaces.Box) -> None:
 
 
 def _is_gray_image(space: spaces.Box) -> bool:
-    """Without an axis of channels, which SB3 expects of an image."""
+    """Whether it is an image without the axis of channels that SB3 expects."""
     of_bytes = space.dtype == np.uint8 and bool((space.low == 0).all() & (space.high == 255).all())
     return len(space.shape) == 2 and of_bytes
 
 
-def size_of(space: spaces.Space) -> int:
-    """:return: numbers in a flat observation"""
-    return spaces.flatdim(space)
-
-
 def flattener(space: spaces.Space) -> Callable[[Any], np.ndarray]:
     """
-    :return: observations with a leading axis, as environments and replay buffers give them, to
-        ``float32`` of shape ``(n, size_of(space))``; choices become one-hot
+    :return: function that maps observations with a leading axis, as environments and replay buffers
+        return them, to ``float32`` of shape ``(n, flatdim(space))``; choices become one-hot
     """
     if isinstance(space, spaces.Dict):
         parts = {name: flattener(part) for name, part in space.spaces.items()}

@@ -1,11 +1,10 @@
-"""Activations, widths and optimisers as users give them: by name, of JAX, optax or torch."""
+"""Activations, widths and optimisers, by name or as functions of JAX, optax or torch."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,46 +13,23 @@ import torch as th
 from torch.nn import functional
 
 Activation = Callable[[jax.Array], jax.Array]
+_NAMES = (
+    *("tanh", "relu", "elu", "gelu", "gelu_exact", "silu", "leaky_relu", "softplus", "celu"),
+    *("selu", "mish", "relu6", "sigmoid", "log_sigmoid", "hard_sigmoid", "hard_swish"),
+    *("hard_tanh", "soft_sign"),
+)
+_GELU_EXACT = partial(jax.nn.gelu, approximate=False)
 ACTIVATIONS: dict[str, Activation] = {
-    "tanh": nn.tanh,
-    "relu": nn.relu,
-    "elu": nn.elu,
-    "gelu": nn.gelu,
-    "gelu_exact": partial(nn.gelu, approximate=False),
-    "silu": nn.silu,
-    "leaky_relu": nn.leaky_relu,
-    "softplus": nn.softplus,
-    "celu": jax.nn.celu,
-    "selu": jax.nn.selu,
-    "mish": jax.nn.mish,
-    "relu6": jax.nn.relu6,
-    "sigmoid": jax.nn.sigmoid,
-    "log_sigmoid": jax.nn.log_sigmoid,
-    "hard_sigmoid": jax.nn.hard_sigmoid,
-    "hard_swish": jax.nn.hard_swish,
-    "hard_tanh": jax.nn.hard_tanh,
-    "soft_sign": jax.nn.soft_sign,
+    name: _GELU_EXACT if name == "gelu_exact" else getattr(jax.nn, name) for name in _NAMES
 }
+# Torch's classes have these names without underscores, and its GELU is the exact one.
+_BY_LETTERS = {name.replace("_", ""): name for name in ACTIVATIONS}
 _TORCH_MODULES: dict[type, str] = {
-    th.nn.Tanh: "tanh",
-    th.nn.ReLU: "relu",
-    th.nn.ELU: "elu",
-    th.nn.GELU: "gelu_exact",
-    th.nn.SiLU: "silu",
-    th.nn.LeakyReLU: "leaky_relu",
-    th.nn.Softplus: "softplus",
-    th.nn.CELU: "celu",
-    th.nn.SELU: "selu",
-    th.nn.Mish: "mish",
-    th.nn.ReLU6: "relu6",
-    th.nn.Sigmoid: "sigmoid",
-    th.nn.LogSigmoid: "log_sigmoid",
-    th.nn.Hardsigmoid: "hard_sigmoid",
-    th.nn.Hardswish: "hard_swish",
-    th.nn.Hardtanh: "hard_tanh",
-    th.nn.Softsign: "soft_sign",
-}
-# Functions of the same names, of which torch has some twice; the first entry counts.
+    kind: _BY_LETTERS[kind.__name__.lower()]
+    for kind in vars(th.nn).values()
+    if isinstance(kind, type) and kind.__name__.lower() in _BY_LETTERS
+} | {th.nn.GELU: "gelu_exact"}
+# With functions of the same names, some of which torch has twice; the first entry counts.
 _OF_TORCH: list[tuple[Any, str]] = [
     *_TORCH_MODULES.items(),
     (functional.gelu, "gelu_exact"),
@@ -67,20 +43,14 @@ _OF_TORCH: list[tuple[Any, str]] = [
 ]
 Weights = Mapping[str, Any]
 OPTIMIZERS = {
-    "adam": optax.adam,
-    "adamw": optax.adamw,
-    "sgd": optax.sgd,
-    "rmsprop": optax.rmsprop,
-    "nadam": optax.nadam,
-    "radam": optax.radam,
-    "adabelief": optax.adabelief,
-    "lion": optax.lion,
-    "adamax": optax.adamax,
-    "adadelta": optax.adadelta,
-    "adagrad": optax.adagrad,
+    name: getattr(optax, name)
+    for name in (
+        *("adam", "adamw", "sgd", "rmsprop", "nadam", "radam"),
+        *("adabelief", "lion", "adamax", "adadelta", "adagrad"),
+    )
 }
-# Of torch's classes: where their defaults are not those of optax. NAdam's momentum has a schedule
-# that optax does not have.
+# Torch's optimisers with the defaults that differ from optax's. NAdam's momentum schedule has no
+# equivalent in optax.
 _TORCH: dict[str, dict[str, Any]] = {
     "adam": {},
     "adamw": {"weight_decay": 1e-2},
@@ -95,17 +65,16 @@ _TORCH: dict[str, dict[str, Any]] = {
 
 def activation(choice: str | Activation | type) -> Activation:
     """
-    :param choice: a name ("relu", any case; "gelu" is JAX's approximation by tanh, "gelu_exact"
-        what torch means by ``GELU``), a JAX function, which is taken as it is, or of torch a
-        function, a module class, or a module without settings of its own
-    :raises ValueError: for a name, or something of torch, without an equal here, and for a function
-        that JAX cannot trace, or that changes the shape of what it is given
+    :param choice: a name ("relu", any case; "gelu" is JAX's approximation by tanh, "gelu_exact" is
+        torch's ``GELU``), a JAX function, or torch's function, module class, or module with default
+        settings
+    :raises ValueError: for a name or an object of torch without an equivalent here, and for a
+        function that JAX cannot trace or that changes the shape of its input
     """
     name = choice if isinstance(choice, str) else _torch_name(choice)
-    known = {key.replace("_", ""): function for key, function in ACTIVATIONS.items()}
-    found = known.get(name.lower().replace("_", ""))
-    if found is not None:
-        return found
+    letters = name.lower().replace("_", "")
+    if letters in _BY_LETTERS:
+        return ACTIVATIONS[_BY_LETTERS[letters]]
     if isinstance(choice, str | type | th.nn.Module) or not callable(choice):
         raise ValueError(
             f"activation_fn must be one of {', '.join(ACTIVATIONS)}, a torch class of such a name, "
@@ -114,10 +83,27 @@ def activation(choice: str | Activation | type) -> Activation:
     return _checked(choice)
 
 
-def activation_name(choice: Any) -> Any:
-    """:return: of a function that is known here, its name; anything else as it is"""
-    names = (name for name, known in ACTIVATIONS.items() if known is choice)
-    return next(names, choice)
+def name_in(table: Mapping[str, Any], choice: Any) -> Any:
+    """:return: the name of a function that the table has; anything else unchanged"""
+    return next((name for name, known in table.items() if known is choice), choice)
+
+
+def by_names(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Replace functions of JAX, which would be pickled by parts of JAX that change, by their names.
+
+    :return: the same arguments with names of activations and optimisers where their functions were
+        given, and lists in place of arrays, whose truth value SB3 evaluates
+    """
+    named = dict(policy_kwargs)
+    for argument, value in policy_kwargs.items():
+        if isinstance(value, np.ndarray):
+            named[argument] = value.tolist()
+        elif argument.endswith("activation_fn"):
+            named[argument] = name_in(ACTIVATIONS, value)
+        elif argument == "optimizer_class":
+            named[argument] = name_in(OPTIMIZERS, value)
+    return named
 
 
 def _checked(function: Activation) -> Activation:
@@ -138,7 +124,7 @@ def _checked(function: Activation) -> Activation:
 
 
 def _torch_name(choice: Any) -> str:
-    """:return: of an activation of torch itself; of anything else, the empty string"""
+    """:return: our name of an activation of torch; for anything else, the empty string"""
     if isinstance(choice, th.nn.GELU) and choice.approximate == "tanh":
         return "gelu"
     kind = type(choice)
@@ -147,8 +133,8 @@ def _torch_name(choice: Any) -> str:
     return next((name for ours, name in _OF_TORCH if ours is choice), "")
 
 
-def widths_of(given: Any) -> tuple[int, ...] | None:
-    """:return: widths of layers as Python has them; None unless all are whole numbers above 0"""
+def _widths_of(given: Any) -> tuple[int, ...] | None:
+    """:return: widths of layers as Python integers; None unless all are whole numbers above 0"""
     if isinstance(given, np.ndarray):
         given = given.tolist()
     if not isinstance(given, Sequence):
@@ -159,15 +145,20 @@ def widths_of(given: Any) -> tuple[int, ...] | None:
 
 
 def widths(
-    net_arch: Sequence[int] | Mapping[str, Sequence[int]], critic: str
+    net_arch: Sequence[int] | Mapping[str, Sequence[int]] | None,
+    critic: str,
+    defaults: Mapping[str, Sequence[int]] | None = None,
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """
     :param critic: the key of the critics' widths, where those of the actor differ
+    :param defaults: by key, for keys that are missing or None; None: both keys are required
     :return: hidden widths of the actor and of the critics
     :raises ValueError: for other keys than ``pi`` and that one, or widths that are no counts
     """
     given = net_arch if isinstance(net_arch, Mapping) else {"pi": net_arch, critic: net_arch}
-    pi, qf = (widths_of(given.get(name)) for name in ("pi", critic))
+    if defaults is not None:
+        given = {**defaults, **{name: each for name, each in given.items() if each is not None}}
+    pi, qf = (_widths_of(given.get(name)) for name in ("pi", critic))
     if given.keys() != {"pi", critic} or pi is None or qf is None:
         raise ValueError(
             f"net_arch must be a list of widths such as [256, 256], or {{'pi': [256], '{critic}': "
@@ -177,15 +168,17 @@ def widths(
 
 
 def finite_leaves(tree: Any) -> bool:
-    """:return: whether no number in it is infinite or not a number"""
+    """:return: whether all numbers of the pytree are finite"""
     numbers = (leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact))
     return all(np.isfinite(leaf).all() for leaf in numbers)
 
 
 class TrainState(NamedTuple):
     """
-    :param weights: flax variables, ``"params"`` and, where there are some, ``"statistics"``
-    :param optimizer: state of the optimiser of the params
+    A network and its optimiser.
+
+    :param weights: flax variables: ``"params"`` and, with batch normalisation, ``"statistics"``
+    :param optimizer: state of the optimiser of ``"params"``
     """
 
     weights: Weights
@@ -195,19 +188,21 @@ class TrainState(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Optimizer:
     """
-    An optax optimiser, without its learning rate, so that schedules act without compiling again.
+    An optax optimiser without its learning rate, so that schedules do not recompile programs.
 
-    :param make: ``optax.adam`` or one that is called like it
+    :param make: ``optax.adam`` or a function with the same signature
     :param arguments: besides the learning rate
     """
 
     make: Callable[..., optax.GradientTransformation]
     arguments: tuple[tuple[str, Any], ...] = ()
 
-    def init(self, params: Any) -> Any:
-        return self._transformation.init(params)
+    def train_state(self, weights: Weights) -> TrainState:
+        """:return: the network with the initial state of its optimiser"""
+        return TrainState(weights, self._transformation.init(weights["params"]))
 
     def apply(self, gradient: Any, trained: TrainState, rate: Any) -> TrainState:
+        """:return: the network and the optimiser after a step with this learning rate"""
         params = trained.weights["params"]
         step, state = self._transformation.update(gradient, trained.optimizer, params)
         step = jax.tree.map(lambda s: rate * s, step)
@@ -221,9 +216,9 @@ class Optimizer:
 
 def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -> Optimizer:
     """
-    :param make: name or function of optax, with its defaults, or torch class, with those of torch
+    :param make: name or function of optax, with its defaults, or torch class, with torch's defaults
     :param arguments: of optax's function, or torch's ``betas`` and ``alpha``
-    :raises ValueError: for one that is not known here
+    :raises ValueError: for an unknown optimiser and for arguments that it does not have
     """
     arguments = dict(arguments)
     if "betas" in arguments:
@@ -232,7 +227,7 @@ def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -
         arguments["decay"] = arguments.pop("alpha")
     name = make if isinstance(make, str) else getattr(make, "__name__", "")
     of_torch = isinstance(make, type) and issubclass(make, th.optim.Optimizer)
-    # A function is taken as it is, whatever its name.
+    # A function is used as given, whatever its name.
     found = OPTIMIZERS.get(name.lower()) if isinstance(make, str) or of_torch else None
     if of_torch:
         if name.lower() not in _TORCH or getattr(th.optim, name) is not make:
@@ -249,12 +244,7 @@ def optimizer_of(make: str | Callable[..., Any], arguments: Mapping[str, Any]) -
         )
     optimizer = Optimizer(found or make, tuple(sorted(arguments.items())))  # type: ignore[arg-type]
     try:
-        optimizer.init({"w": jnp.zeros(1)})
+        optimizer.train_state({"params": jnp.zeros(1)})
     except TypeError as error:
         raise ValueError(f"optimizer_kwargs {arguments!r} do not fit {name}: {error}.") from None
     return optimizer
-
-
-def optimizer_name(choice: Any) -> Any:
-    """:return: of a function of optax that is known here, its name; anything else as it is"""
-    return next((name for name, known in OPTIMIZERS.items() if known is choice), choice)

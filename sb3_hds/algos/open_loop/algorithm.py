@@ -1,4 +1,4 @@
-"""Open loop: a few oscillators move the joints, and CMA-ES finds their constants."""
+"""Open loop: oscillators move the joints, and CMA-ES optimises their constants."""
 
 import dataclasses
 import secrets
@@ -19,8 +19,8 @@ from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.base.construct import (
     check_log_interval,
     check_origin,
+    checked_timesteps,
     jax_device,
-    whole_steps,
 )
 from sb3_hds.algos.base.policy import TensorPolicy
 from sb3_hds.algos.base.saving import SavesTensors
@@ -41,36 +41,34 @@ from sb3_hds.errors import EnvironmentMismatchError, ParameterError
 class OpenLoop(SavesTensors):
     r"""
     One oscillator per joint, :math:`q_i^*(t) = a_i \sin(\theta_i(t) + \varphi_i) + b_i`, with one
-    frequency while it swings and one while it stands, and a loop that tracks it,
-    :math:`u = k_p (q^* - q) - k_d\,\dot q`. Nothing else of the observation is looked at.
+    frequency for swing and one for stance, and a tracking loop, :math:`u = k_p (q^* - q) -
+    k_d\,\dot q`. The rest of the observation is not used.
 
     Source: Raffin et al., *An Open-Loop Baseline for Reinforcement Learning Locomotion Tasks*, RLJ
-    2024. It searches by CMA-ES too; what its ranges were and how it reckoned with the noise of
-    resets is not published. Here:
+    2024. It uses CMA-ES, too; its ranges and its treatment of random resets are not published.
+    Here:
 
     - all candidates of a generation start from the same resets, and are compared by their mean
       returns
-    - rollouts are cut off after ``horizon`` steps, so that there are more of them
+    - episodes are truncated after ``horizon`` steps, so that there are more of them
     - the last ``ranking_share`` of the steps compares the best candidates and the mean of the
-      distribution over whole episodes from fresh resets; the worse half drops out each time
+      distribution on full episodes from new resets; the worse half drops out in each round
 
-    **Where joints come from.** In environments of MuJoCo every actuator tracks the joint that the
-    model says it drives (``actuator_trnid``). Position and velocity are read from the observation
-    where it has them all (HalfCheetah, Ant, Hopper, Walker2d, Swimmer, Humanoid, ...), so a model
-    predicts in any copy of the environment, also in one that ``rl_zoo3 enjoy`` made. Otherwise
-    (Reacher, Pusher) they are read from the environment itself: then ``predict`` works for the
-    environment that the model has, or that ``read_joints_from`` names, and for no other, unless
-    the wrapper ``ShowJoints`` adds them to the observation. Where there are no joints (Pendulum-v1)
-    the oscillators are the commands. Observations that ``VecNormalize`` scales do not show joints,
-    and are refused.
+    **Joints.** In MuJoCo environments, every actuator tracks the joint that it drives
+    (``actuator_trnid``). Position and velocity are read from the observation if it contains all of
+    them (HalfCheetah, Ant, Hopper, Walker2d, Swimmer, Humanoid, ...), so that a model predicts in
+    any copy of the environment, such as that of ``rl_zoo3 enjoy``. Otherwise (Reacher, Pusher),
+    they are read from the environment: then ``predict`` works only for the environment of the model
+    or of ``read_joints_from``, unless the wrapper ``ShowJoints`` adds the joints to the
+    observation. Without joints (Pendulum-v1), the oscillators are the commands. Observations that
+    ``VecNormalize`` scales do not contain joint positions, and are refused.
 
-    **The phase** is the recurrent state of ``predict``: pass on what it returned, as
-    ``evaluate_policy``, ``EvalCallback`` and ``rl_zoo3 enjoy`` do. Without it every call is the
-    first of an episode.
+    **The phase** is the recurrent state of ``predict``: pass on the returned state, as
+    ``evaluate_policy``, ``EvalCallback`` and ``rl_zoo3 enjoy`` do. Without it, every call is the
+    first one of an episode.
 
-    Resets between the ends of episodes have to be allowed (``Monitor(allow_early_resets=True)``,
-    the default). A ``VecEnv`` that cannot reset one of its copies runs whole episodes from whatever
-    starts it draws.
+    The environment must allow resets during episodes (``Monitor(allow_early_resets=True)``, the
+    default). A ``VecEnv`` that cannot reset a single copy runs full episodes from its own resets.
     """
 
     default_timesteps: ClassVar[int] = 200_000
@@ -78,7 +76,7 @@ class OpenLoop(SavesTensors):
         "MlpPolicy": OscillatorPolicy,
         "MultiInputPolicy": OscillatorPolicy,
     }
-    #: what a policy class must extend
+    #: base class that every policy of the algorithm extends
     policy_family: ClassVar[type[TensorPolicy]] = OscillatorPolicy
     policy: OscillatorPolicy
 
@@ -92,7 +90,7 @@ class OpenLoop(SavesTensors):
         frequency: Any = np.atleast_1d(np.asarray(config.frequency, float)).tolist()
         gait = config.gait if isinstance(config.gait, str | None) else list(config.gait)
         config = dataclasses.replace(config, frequency=frequency, gait=gait)
-        # SB3 wants a learning rate; nothing here has one.
+        # SB3 requires a learning rate, which is not used.
         super().construct(config, learning_rate=0.0, **more)
         self.robot: dict[str, Any] | None = None
 
@@ -103,7 +101,7 @@ class OpenLoop(SavesTensors):
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         if self.env is not None:
-            self._meet(self.env)
+            self._inspect_env(self.env)
         assert self.robot is not None
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space,
@@ -112,19 +110,19 @@ class OpenLoop(SavesTensors):
             robot=self.robot,
             **self.policy_kwargs,
         )
-        self._bind()
+        self._choose_joint_source()
         self._restart(np.zeros(self.gait_space.dim))
         self.policy.constants = self.gait_space.decode(self.policy.search.mean)
 
     @property
     def gait_space(self) -> GaitSpace:
-        """The gaits that are searched."""
+        """The search space of gaits."""
         assert self.robot is not None
         return self.config.gait_space(Robot(**self.robot))
 
     @property
     def constants(self) -> dict[str, Any]:
-        """What acts, as plain data that :meth:`set_constants` takes [rad, rad/s]."""
+        """The gait that acts, as arguments of :meth:`set_constants` [rad, rad/s]."""
         return {name: part.tolist() for name, part in self.policy.constants._asdict().items()}
 
     def set_constants(
@@ -139,10 +137,10 @@ class OpenLoop(SavesTensors):
         kd: Sequence[float] | float | None = None,
     ) -> Self:
         """
-        Let a known gait act: a published one, or ``constants`` of another model. A search that
-        follows starts there, and replaces it by what is better on fresh resets.
+        Set the gait that acts: a published one, or ``constants`` of another model. The next search
+        starts there, and replaces it by gaits that are better on new resets.
 
-        One number stands for all joints, whose order is that of the actuators.
+        A single number is for all joints, whose order is that of the actuators.
 
         :param omega_swing: while the sine is positive [rad/s]
         :param omega_stance: while it is not [rad/s]
@@ -174,11 +172,11 @@ class OpenLoop(SavesTensors):
 
     def read_joints_from(self, env: VecEnv | None) -> None:
         """
-        Let ``predict`` read joints from an environment, as motors have encoders of their own,
-        whatever happens to the observation.
+        Let ``predict`` read joints from an environment, as from the encoders of motors, instead of
+        the observation.
 
-        :param env: with as many copies as there will be observations; None: from the observation
-        :raises EnvironmentMismatchError: if it is none of MuJoCo
+        :param env: with as many copies as there will be observations; None: use the observation
+        :raises EnvironmentMismatchError: if it is no MuJoCo environment
         """
         if env is not None:
             refuse_without_state(env)
@@ -186,7 +184,7 @@ class OpenLoop(SavesTensors):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
-        SB3's ``set_env``; what is known of joints and time is found out again.
+        SB3's ``set_env``, which also determines joints and time step again.
 
         :raises EnvironmentMismatchError: if it has other joints
         """
@@ -195,7 +193,7 @@ class OpenLoop(SavesTensors):
         if self.env is before:
             return
         assert self.env is not None
-        self._meet(self.env)
+        self._inspect_env(self.env)
         assert robot is not None and self.robot is not None
         if self.robot["names"] != robot["names"]:
             raise EnvironmentMismatchError(
@@ -204,7 +202,7 @@ class OpenLoop(SavesTensors):
             )
         self.policy.robot = Robot(**self.robot)
         self.policy.constants = self.policy.constants
-        self._bind()
+        self._choose_joint_source()
 
     def learn(
         self,
@@ -216,17 +214,19 @@ class OpenLoop(SavesTensors):
         progress_bar: bool = False,
     ) -> Self:
         """
-        Search for better constants. Called again, it goes on where it stopped.
+        Search for better constants. A further call continues the search.
 
         :param total_timesteps: steps of the environment; default ``default_timesteps``
         :param callback: called at every step of the environment
         :param log_interval: generations between two log lines; None: no lines
         :param tb_log_name: name of the run for TensorBoard; default: the class's name
-        :param reset_num_timesteps: False goes on counting
-        :param progress_bar: show one
+        :param reset_num_timesteps: False continues the count of timesteps
+        :param progress_bar: whether to show a progress bar
         """
         check_log_interval(log_interval)
-        total = whole_steps(self.default_timesteps if total_timesteps is None else total_timesteps)
+        total = checked_timesteps(
+            self.default_timesteps if total_timesteps is None else total_timesteps
+        )
         name = tb_log_name or type(self).__name__
         total_timesteps, callback = self._setup_learn(
             total, callback, reset_num_timesteps, name, progress_bar
@@ -235,7 +235,7 @@ class OpenLoop(SavesTensors):
         search_until = total_timesteps - self.config.ranking_share * total
         trials = Trials(self, self.policy, callback, total_timesteps)
         going, latest = True, 0
-        # A generation more must not take the steps of the ranking.
+        # The next generation must not use the steps of the ranking.
         while going and self.num_timesteps + max(latest, 1) <= search_until:
             before = self.num_timesteps
             going = self._generation(trials, callback, log_interval)
@@ -246,7 +246,7 @@ class OpenLoop(SavesTensors):
         return self
 
     def _generation(self, trials: Trials, callback: BaseCallback, log_interval: int | None) -> bool:
-        """:return: whether all of its candidates were tried"""
+        """:return: whether all candidates of the generation were evaluated"""
         search, space = self.policy.search, self.gait_space
         gaits = _stacked([space.decode(point) for point in cma_es.candidates(search)])
         seeds = cma_es.reset_seeds(search)
@@ -271,7 +271,7 @@ class OpenLoop(SavesTensors):
         return True
 
     def _rank(self, trials: Trials, log_interval: int | None) -> None:
-        """Rounds of whole episodes, all finalists from the same fresh reset in each."""
+        """Compare the finalists in rounds of full episodes, each from the same new reset."""
         space, search = self.gait_space, self.policy.search
         found = np.isfinite(search.elite_returns)
         points = [search.mean, *search.elites[found]]
@@ -296,7 +296,8 @@ class OpenLoop(SavesTensors):
             self.policy.constants = finalists[left[0]]
             self.policy.search = self.policy.search._replace(ranked=np.asarray(True))
             self.logger.record("search/best_whole_episodes", float(np.mean(scores[left[0]])))
-            self._dump(log_interval)
+            if log_interval is not None:
+                self.dump_logs()
             if len(scores[left[0]]) > 1 and len(left) > 2:
                 left = left[: max(2, len(left) // 2)]
 
@@ -308,10 +309,6 @@ class OpenLoop(SavesTensors):
         record("search/best_return_so_far", float(search.elite_returns[0]))
         record("search/sigma", float(search.sigma))
         if log_interval is not None and int(search.generation) % log_interval == 0:
-            self._dump(log_interval)
-
-    def _dump(self, log_interval: int | None) -> None:
-        if log_interval is not None:
             self.dump_logs()
 
     def dump_logs(self) -> None:
@@ -332,12 +329,12 @@ class OpenLoop(SavesTensors):
 
     @property
     def _n_updates(self) -> int:
-        """Complete generations."""
+        """Number of complete generations."""
         return int(self.policy.search.generation)
 
     @_n_updates.setter
     def _n_updates(self, n: int) -> None:
-        """SB3 sets it to zero at first; the search counts itself."""
+        """Ignore SB3's initial value: the search counts its generations."""
 
     def _restart(self, start: np.ndarray) -> None:
         dim, config = len(start), self.config
@@ -350,11 +347,11 @@ class OpenLoop(SavesTensors):
             config.n_elites,
         )
 
-    def _meet(self, env: VecEnv) -> None:
+    def _inspect_env(self, env: VecEnv) -> None:
         """
-        Find out what there is to know of an environment.
+        Determine joints and time step of an environment.
 
-        :raises EnvironmentMismatchError: if its joints do not come in as many legs as the gait has
+        :raises EnvironmentMismatchError: if its joints cannot be divided among the gait's legs
         """
         config = self.config
         robot = robot_of(env, config.control, config.joints, config.dt)
@@ -372,8 +369,8 @@ class OpenLoop(SavesTensors):
             )
         self.robot = robot.to_dict()
 
-    def _bind(self) -> None:
-        """Where the observation does not show the joints, they are read from the environment."""
+    def _choose_joint_source(self) -> None:
+        """Read joints from the environment if the observation does not contain them."""
         robot = self.policy.robot
         assert robot is not None
         unseen = robot.control == "track" and not robot.seen_position
@@ -385,7 +382,7 @@ def _stacked(gaits: Sequence[Constants]) -> Constants:
 
 
 def _sized(name: str, value: Any, joints: Sequence[str]) -> np.ndarray:
-    """One number per joint, or the number that both frequencies are."""
+    """:return: one number per joint; a frequency is a single number"""
     array = np.asarray(value, float)
     of_all = name.startswith("omega")
     if array.shape not in (((),) if of_all else ((), (len(joints),))):

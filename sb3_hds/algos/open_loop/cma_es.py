@@ -1,4 +1,4 @@
-"""Black-box search by CMA-ES, generation by generation, whose state is a pytree of arrays."""
+"""Black-box optimisation by CMA-ES with a state that is a pytree of arrays."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -8,26 +8,28 @@ from jaxtyping import Float, Int
 if TYPE_CHECKING:
     from cmaes import CMA
 
-# Where generations and rounds of a ranking get their random numbers.
+# Separate streams of random numbers.
 _SAMPLES, _RESETS, _ROUNDS = 0, 1, 2
 _LARGEST = 2**31 - 1
 
 
 class SearchState(NamedTuple):
     """
+    State of a search.
+
     :param seed: of all random numbers
-    :param generation: how many are complete
+    :param generation: number of complete generations
     :param mean: of the distribution
-    :param covariance: up to ``sigma`` squared
+    :param covariance: of the distribution, divided by ``sigma`` squared
     :param sigma: step size
     :param path_sigma: evolution path of the step size
     :param path_covariance: evolution path of the covariance
-    :param returns: of this generation: one row per candidate, one column per reset, -inf where
-        it is not known yet
+    :param returns: of this generation: one row per candidate, one column per reset; -inf: not yet
+        known
     :param elites: best candidates so far, best first
-    :param elite_returns: their means over resets, -inf for places that are free
-    :param ranked: whether the acting candidate has been compared on fresh resets
-    :param n_rounds: rounds of rankings so far
+    :param elite_returns: mean returns of the elites; -inf: no candidate yet
+    :param ranked: whether the acting candidate has been compared on new resets
+    :param n_rounds: number of ranking rounds so far
     """
 
     seed: np.ndarray
@@ -54,10 +56,12 @@ def init_search(
 ) -> SearchState:
     """
     :param start: mean of the first generation
-    :param sigma: its standard deviation
-    :param population: candidates in a generation
-    :param n_resets: episodes of each of them
-    :return: a search that has seen nothing
+    :param sigma: standard deviation of the first generation
+    :param seed: of all random numbers
+    :param population: candidates per generation
+    :param n_resets: episodes per candidate
+    :param n_elites: number of elites
+    :return: the initial state of a search
     """
     dim = len(start)
     return SearchState(
@@ -77,32 +81,34 @@ def init_search(
 
 
 def default_population(dim: int) -> int:
-    """:return: candidates in a generation, as in Hansen's tutorial (2016), equation 48"""
+    """:return: candidates per generation, as in Hansen's tutorial (2016), equation 48"""
     return 4 + int(3.0 * np.log(dim))
 
 
 def candidates(state: SearchState) -> Float[np.ndarray, "population dim"]:
-    """:return: of this generation, always the same ones"""
-    return _asked(_restored(state), len(state.returns))
+    """:return: the candidates of this generation, the same ones in each call"""
+    return _sampled(_restored(state), len(state.returns))
 
 
 def reset_seeds(state: SearchState) -> Int[np.ndarray, " resets"]:
-    """:return: with which every candidate of this generation is reset"""
+    """:return: seeds of the resets of every candidate of this generation"""
     return _seeds(state, _RESETS, int(state.generation), state.returns.shape[1])
 
 
 def round_seed(state: SearchState) -> int:
-    """:return: with which all finalists are reset in the next round of a ranking"""
+    """:return: seed of the reset of all finalists in the next ranking round"""
     return int(_seeds(state, _ROUNDS, int(state.n_rounds), 1)[0])
 
 
 def tell(state: SearchState) -> SearchState:
     """
+    Update the distribution (CMA-ES's "tell").
+
     :param state: with all returns of its generation
-    :return: at the start of the next generation
+    :return: the state at the start of the next generation
     """
     search = _restored(state)
-    points = _asked(search, len(state.returns))
+    points = _sampled(search, len(state.returns))
     values = state.returns.mean(axis=1)
     search.tell([(x, -value) for x, value in zip(points, values, strict=True)])
     learned = vars(search)
@@ -123,8 +129,8 @@ def tell(state: SearchState) -> SearchState:
 
 
 def _restored(state: SearchState) -> "CMA":
-    """``cmaes`` has no public way to go on with a search, so its attributes are set."""
-    from cmaes import CMA  # it imports scipy.stats, for which no other learner should wait
+    """Set private attributes: ``cmaes`` has no public way to continue a search."""
+    from cmaes import CMA  # imports scipy.stats, which is slow and only needed here
 
     search = CMA(
         mean=np.array(state.mean),
@@ -141,7 +147,7 @@ def _restored(state: SearchState) -> "CMA":
     return search
 
 
-def _asked(search: "CMA", n: int) -> Float[np.ndarray, "population dim"]:
+def _sampled(search: "CMA", n: int) -> Float[np.ndarray, "population dim"]:
     return np.stack([search.ask() for _ in range(n)])
 
 

@@ -18,29 +18,29 @@ class OpenLoopConfig(Config):
     """
     Arguments of OpenLoop.
 
-    :param policy: ``"MlpPolicy"`` (there is no other, and no network in it), or the environment
+    :param policy: ``"MlpPolicy"`` (the only one, without a network), or the environment
     :param env: an environment, its id, or a vectorised environment: candidates run in parallel
-    :param population_size: candidates in a generation; None: ``4 + 3 log(dim)``
-    :param n_resets: episodes of each candidate in a generation
+    :param population_size: candidates per generation; None: ``4 + 3 log(dim)``
+    :param n_resets: episodes per candidate and generation
     :param horizon: steps of such an episode; None: until it ends
     :param initial_sigma: standard deviation of the first generation, before squashing
-    :param n_elites: best candidates so far that are ranked in the end
-    :param ranking_share: of the steps of ``learn``, for the ranking
+    :param n_elites: number of best candidates that are ranked at the end
+    :param ranking_share: share of the steps of ``learn`` for the ranking
     :param kp: command per rad of error
     :param kd: command per rad/s
-    :param gain_factor: gains are searched up and down by it; 1: not
-    :param amplitude: largest one [rad]; where there are no joints, in half ranges of the command
-    :param offset: largest one [rad] up and down from where the model rests; without joints, in half
-        ranges of the command
-    :param frequency: smallest and largest [Hz]
-    :param same_frequency: one for swing and stance
-    :param phases: False: all joints move together
-    :param gait: all legs do the same, each with a lead of its own: ``"trot"``, ``"pace"``,
-        ``"bound"`` or ``"walk"`` of the legs front left, front right, hind left, hind right, or a
-        lead for each leg [rad]. Joints come leg by leg, of the same sense. None: each for itself
+    :param gain_factor: gains are searched within this factor up and down; 1: fixed gains
+    :param amplitude: largest amplitude [rad]; without joints, in half ranges of the command
+    :param offset: largest offset from the model's rest position, up and down [rad]; without joints,
+        in half ranges of the command
+    :param frequency: smallest and largest frequency [Hz]
+    :param same_frequency: whether swing and stance have the same frequency
+    :param phases: False: all joints move in phase
+    :param gait: all legs move alike, each with its own lead: ``"trot"``, ``"pace"``, ``"bound"`` or
+        ``"walk"`` of the legs front left, front right, hind left, hind right, or a lead for each
+        leg [rad]. Joints must be sorted by leg and have the same sense. None: independent joints
     :param control: ``"track"`` joints, ``"direct"`` commands, or ``"auto"``
     :param joints: read from the ``"observation"``, from the ``"env"``, or ``"auto"``
-    :param dt: how long a step takes [s]; None: as the environment says
+    :param dt: time step [s]; None: that of the environment
     :param policy_kwargs: the policy has none
     """
 
@@ -90,13 +90,13 @@ class OpenLoopConfig(Config):
 
     @property
     def leads(self) -> tuple[float, ...]:
-        """Of each leg [rad]."""
+        """Lead of each leg [rad]."""
         if self.gait is None:
             return (0.0,)
         return LEADS[self.gait] if isinstance(self.gait, str) else tuple(self.gait)
 
     def gait_space(self, robot: Robot) -> GaitSpace:
-        """:return: the gaits of a robot that are searched"""
+        """:return: the search space of a robot's gaits"""
         lower, upper, rest = (np.array(x) for x in (robot.lower, robot.upper, robot.rest))
         half = 0.5 * (upper - lower) if robot.control == "direct" else np.ones(len(rest))
         centre = np.clip(rest, lower, upper)

@@ -1,4 +1,4 @@
-"""The gaits that a search may visit, as points of an unbounded space."""
+"""The search space of gaits, whose points are unbounded vectors."""
 
 import dataclasses
 import math
@@ -13,14 +13,14 @@ Point = Float[np.ndarray, " dim"]
 PerJoint = Float[np.ndarray, " act"]
 
 _TURN = 2.0 * math.pi
-# A gait at the edge of the space would be infinitely far out.
+# Gaits at the limits would be infinitely far: encoded shares of a range keep this distance.
 _EDGE = 1e-3
 
 
 class Constants(NamedTuple):
     """
-    What a policy consists of: the oscillators of
-    :class:`~sb3_hds.core.transforms.oscillators.Gait`, and the gains of the loop that tracks them.
+    Constants of a policy: those of :class:`~sb3_hds.core.transforms.oscillators.Gait`, and the
+    gains of the tracking loop.
 
     :param amplitude: per joint [rad]
     :param offset: per joint [rad]
@@ -43,19 +43,19 @@ class Constants(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class GaitSpace:
     """
-    Amplitudes, offsets and logarithms of frequencies and gains are squashed into their ranges by a
-    logistic function; phases count turns, are not bounded, and that of the first joint is 0.
+    A logistic function squashes amplitudes, offsets and logarithms of frequencies and gains into
+    their ranges; phases are unbounded, in turns, with 0 for the first joint.
 
     :param amplitude: largest amplitude of each joint
     :param offset: range of the offset of each joint, shape ``(act, 2)``
     :param frequency: range of both frequencies [Hz]
-    :param kp: gain of the tracking; searched up and down by ``gain_factor``
-    :param kd: gain of the tracking of velocities; searched up and down by ``gain_factor``
+    :param kp: proportional gain, searched within ``gain_factor`` up and down
+    :param kd: derivative gain, searched within ``gain_factor`` up and down
     :param gain_factor: 1: gains are not searched
-    :param same_frequency: whether swing and stance have one
-    :param phases: whether joints have phases of their own; otherwise they move together
-    :param leads: phase of each leg [rad], where all legs do the same and joints come leg by leg:
-        amplitudes, offsets and phases are searched for one of them
+    :param same_frequency: whether swing and stance have the same frequency
+    :param phases: whether joints have their own phases; otherwise they move in phase
+    :param leads: phase of each leg [rad], for legs that move alike and joints sorted by leg:
+        amplitudes, offsets and phases of one leg are searched
     """
 
     amplitude: PerJoint
@@ -70,18 +70,18 @@ class GaitSpace:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """How many coordinates stand for amplitudes, offsets, phases, frequencies and gains."""
+        """Numbers of coordinates for amplitudes, offsets, phases, frequencies and gains."""
         n = len(self.amplitude) // len(self.leads)
         n_phases = n - 1 if self.phases else 0
         return n, n, n_phases, 1 if self.same_frequency else 2, 2 if self.gain_factor > 1.0 else 0
 
     @property
     def dim(self) -> int:
-        """How many numbers are searched."""
+        """Dimension of the search space."""
         return sum(self.sizes)
 
     def decode(self, point: Point) -> Constants:
-        """:return: the gait that a point stands for"""
+        """:return: the gait of a point"""
         n, legs = len(self.amplitude), len(self.leads)
         a, b, turns, f, gains = np.split(point, np.cumsum(self.sizes)[:-1])
         low, high = self.offset.T
@@ -102,31 +102,31 @@ class GaitSpace:
 
     def encode(self, gait: Constants) -> Point:
         """
-        :return: the point that stands for a gait, from the moment when the phase of its first joint
-            is 0, with gains that are one for all; clipped to the space. A negative amplitude
-            becomes a phase of half a turn, which is the same only where both frequencies are. Where
-            all legs do the same, they do the mean, with the phases of the first.
+        :return: the point of a gait, clipped to the space: it starts when the phase of the first
+            joint is 0, and gains are averaged over joints. A negative amplitude becomes a phase of
+            half a turn, which is equivalent only if both frequencies are equal. For legs that move
+            alike, amplitudes and offsets are averaged, and phases are those of the first leg.
         """
         low, high = self.offset.T
         frequencies = np.log([gait.omega_swing, gait.omega_stance]) - math.log(_TURN)
         first, last = np.log(self.frequency)
         f = (frequencies - first) / (last - first)
         parts = [
-            _spread(self._of_legs(np.abs(gait.amplitude) / self.amplitude)),
-            _spread(self._of_legs((gait.offset - low) / (high - low))),
+            _unsquashed(self._of_legs(np.abs(gait.amplitude) / self.amplitude)),
+            _unsquashed(self._of_legs((gait.offset - low) / (high - low))),
             _from_first(gait)[: self.sizes[2]] / _TURN,
-            _spread(f.mean(keepdims=True) if self.same_frequency else f),
+            _unsquashed(f.mean(keepdims=True) if self.same_frequency else f),
         ]
         if self.gain_factor > 1.0:
             ratios = np.array([np.mean(gait.kp) / self.kp, np.mean(gait.kd) / self.kd])
-            parts.append(_spread(0.5 + 0.5 * np.log(ratios) / math.log(self.gain_factor)))
+            parts.append(_unsquashed(0.5 + 0.5 * np.log(ratios) / math.log(self.gain_factor)))
         return np.concatenate(parts)
 
     def _of_legs(self, values: PerJoint) -> np.ndarray:
         return values.reshape(len(self.leads), -1).mean(axis=0)
 
     def _led(self, within: np.ndarray, swing: float, stance: float) -> PerJoint:
-        """Legs are ahead in time: a lead of half a turn is half of a cycle."""
+        """Leads are times: half a turn is half of a cycle."""
         if len(self.leads) == 1:
             return within
         cycle = math.pi / swing + math.pi / stance
@@ -135,19 +135,19 @@ class GaitSpace:
 
 
 def _from_first(gait: Constants) -> PerJoint:
-    """Phases of all joints but the first, when that of the first is 0."""
+    """:return: phases of all joints but the first, at the time when that of the first is 0"""
     phase = np.mod(gait.phase + math.pi * (gait.amplitude < 0.0), _TURN)
     swing, stance = float(gait.omega_swing), float(gait.omega_stance)
     half = math.pi / swing
-    gone = phase[0] / swing if phase[0] < math.pi else half + (phase[0] - math.pi) / stance
-    left = float(half + math.pi / stance - gone)
-    return advance_phase(phase, left, swing, stance)[1:]
+    elapsed = phase[0] / swing if phase[0] < math.pi else half + (phase[0] - math.pi) / stance
+    remaining = float(half + math.pi / stance - elapsed)
+    return advance_phase(phase, remaining, swing, stance)[1:]
 
 
 def _squashed(x: np.ndarray) -> np.ndarray:
     return 1.0 / (1.0 + np.exp(-x))
 
 
-def _spread(share: np.ndarray) -> np.ndarray:
+def _unsquashed(share: np.ndarray) -> np.ndarray:
     share = np.clip(share, _EDGE, 1.0 - _EDGE)
     return np.log(share / (1.0 - share))

@@ -1,4 +1,4 @@
-"""A policy that is a handful of oscillators, and the loop that makes joints follow them."""
+"""A policy of oscillators and a loop that tracks them."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
 
-from sb3_hds.algos.base.policy import TensorPolicy, TrainingTensors, refuse_odd
+from sb3_hds.algos.base.policy import TensorPolicy, check_observation
 from sb3_hds.algos.open_loop.cma_es import SearchState
 from sb3_hds.algos.open_loop.gait import Constants
 from sb3_hds.algos.open_loop.robot import Robot
@@ -21,7 +21,7 @@ from sb3_hds.deploy.policy_function import Joints, Memory, PolicyFunction
 from sb3_hds.errors import EnvironmentMismatchError
 from sb3_hds.wrappers.actuated_joints import track
 
-# Steps for which targets are computed at a time.
+# Number of steps for which targets are computed at once.
 _CHUNK = 1_000
 
 Targets = Float[np.ndarray, "n_envs act"]
@@ -29,23 +29,22 @@ Targets = Float[np.ndarray, "n_envs act"]
 
 class Timetable:
     """
-    Targets of several gaits at every step, computed a thousand steps at a time.
-
-    Action k, which acts from k dt to (k + 1) dt, aims at the middle of that interval.
+    Targets of several gaits at every step, computed a thousand steps at a time. The target of
+    action k, which acts from k dt to (k + 1) dt, is that of the middle of this interval.
 
     :param gaits: stacked, one per row
-    :param dt: [s]
+    :param dt: time step [s]
     """
 
     def __init__(self, gaits: Constants, dt: float) -> None:
-        # Double precision: the phase is kept over a thousand turns and more.
+        # Double precision, for phases of thousands of turns.
         with jax.enable_x64(True):
             self._gait = Gait(*(jnp.asarray(part, float) for part in gaits[:5]))
         self._dt = dt
         self._targets = np.zeros((len(gaits.amplitude), 0, gaits.amplitude.shape[1]))
 
     def at(self, rows: Int[np.ndarray, " n"], steps: Int[np.ndarray, " n"]) -> Targets:
-        """:return: what each of the gaits ``rows`` aims at in its step of ``steps``"""
+        """:return: targets of the gaits ``rows``, each in its step of ``steps``"""
         while steps.size and self._targets.shape[1] <= int(steps.max()):
             with jax.enable_x64(True):
                 more = _targets(self._gait, float(self._targets.shape[1]), self._dt)
@@ -57,13 +56,13 @@ class OscillatorPolicy(TensorPolicy):
     """
     ``"MlpPolicy"`` of :class:`~sb3_hds.algos.OpenLoop`, which has no network.
 
-    The recurrent ``state`` of ``predict`` is how many steps ago each episode started.
+    The recurrent ``state`` of ``predict`` is the number of steps since the start of each episode.
 
-    :param observation_space: of any kind; a Box with one axis where joints are read from it
+    :param observation_space: any space; a Box with one axis if joints are read from it
     :param action_space: a bounded Box of any shape
-    :param lr_schedule: as SB3 passes it; not looked at
-    :param robot: what is known of the system, see :class:`~sb3_hds.algos.open_loop.robot.Robot`
-    :param use_sde: accepted for SB3's sake
+    :param lr_schedule: passed by SB3; not used
+    :param robot: time step and joints, see :class:`~sb3_hds.algos.open_loop.robot.Robot`
+    :param use_sde: passed by SB3; not used
     """
 
     def __init__(
@@ -84,14 +83,13 @@ class OscillatorPolicy(TensorPolicy):
         zero, one = np.zeros(n), np.asarray(1.0)
         self.constants = Constants(zero, zero, zero, one, one, zero, zero)
         self.search: SearchState
-        #: returns the states of all copies of the environment, where joints are not observed
+        #: returns the states of all copies of the environment, if joints are not observed
         self.read_states: Callable[[], np.ndarray] | None = None
         self._lone_calls = 0
-        self.optimizer = TrainingTensors(self)  # type: ignore[assignment]  # what SB3 saves
 
     @property
     def constants(self) -> Constants:
-        """What acts."""
+        """Constants of the gait that acts."""
         return self._constants
 
     @constants.setter
@@ -109,16 +107,16 @@ class OscillatorPolicy(TensorPolicy):
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
         :param observation: one, or a batch with one row for each copy of the environment
-        :param state: what the last call returned; None: all episodes start now
-        :param episode_start: which episodes start now
-        :return: action of the same number of rows, in the units of the action space; the state to
-            pass next time
+        :param state: that the last call returned; None: all episodes start
+        :param episode_start: which episodes start
+        :return: actions, one row per observation, in units of the action space; the state for the
+            next call
         :raises ValueError: if the observation has another shape than the observation space, or is
             not finite
-        :raises EnvironmentMismatchError: if joints have to be read from an environment that the
-            policy does not have
+        :raises EnvironmentMismatchError: if joints must be read from an environment and the policy
+            has none
         """
-        refuse_odd(observation)
+        check_observation(observation)
         rows, several = self._as_rows(observation)
         n = len(next(iter(rows.values()))) if isinstance(rows, dict) else len(rows)
         if state is None:
@@ -136,9 +134,9 @@ class OscillatorPolicy(TensorPolicy):
         """
         :param targets: one row for each copy of the environment
         :param observations: one row for each copy of the environment
-        :param kp: gains, one row for each, or one for all
-        :param kd: gains of velocities, one row for each, or one for all
-        :return: actions, within their bounds
+        :param kp: proportional gains, one row for each copy, or one for all
+        :param kd: derivative gains, one row for each copy, or one for all
+        :return: actions, within their limits
         """
         robot = self.robot
         if robot is not None and robot.control == "track":
@@ -149,7 +147,7 @@ class OscillatorPolicy(TensorPolicy):
         return np.clip(targets.reshape(-1, *box.shape), box.low, box.high).astype(box.dtype)
 
     def policy_function(self) -> PolicyFunction:
-        """:return: what the policy computes, with the phases of its oscillators as memory"""
+        """:return: the policy with the phases of its oscillators as memory, to be exported"""
         robot, gait = self.robot, self.constants
         omega = float(gait.omega_swing), float(gait.omega_stance)
         dt = robot.dt if robot else 1.0
@@ -188,7 +186,7 @@ class OscillatorPolicy(TensorPolicy):
         return robot.in_states(states)
 
     def _as_rows(self, observation: Any) -> tuple[Any, bool]:
-        """Observations with one row for each copy, and whether there were rows."""
+        """:return: observations with one row for each copy, and whether they had rows already"""
         if isinstance(observation, dict):
             (key, space), *_ = self.observation_space.items()  # type: ignore[attr-defined]
             several = np.ndim(observation[key]) > len(space.shape)
@@ -208,14 +206,8 @@ class OscillatorPolicy(TensorPolicy):
                 "action, state = model.predict(obs, state=state, episode_start=done)."
             )
 
-    def forward(self, obs: Any, deterministic: bool = False) -> np.ndarray:
-        return self.predict(obs)[0]
-
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
-        return self.predict(np.asarray(observation))[0]
-
-    def reset_noise(self, batch_size: int = 1) -> None:
-        """Nothing to reset: nothing is drawn."""
+        return self.predict(observation)[0]
 
     @property
     def weights(self) -> Any:

@@ -1,4 +1,4 @@
-"""What an open-loop policy knows of the system that it moves: its time step and its joints."""
+"""What an open-loop policy needs to know of an environment: time step and joints."""
 
 import dataclasses
 import functools
@@ -18,41 +18,40 @@ from sb3_hds.wrappers.actuated_joints import (
 )
 from sb3_hds.wrappers.interval import interval_from
 
-# Resets, which differ from each other, that must agree on where a joint is in the observation.
+# Number of different resets in which an entry of the observation must equal a joint's state, and
+# the tolerance.
 _N_RESETS = 3
 _EQUAL = 1e-6
-# Of a joint without a range [rad] or [m].
-_WIDEST_OFFSET = np.pi
 
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
     """
-    Plain data, saved with a model.
+    Time step and joints of an environment, as plain data that are saved with a model.
 
-    :param dt: how long a step takes [s]
-    :param control: ``"track"``: actuators follow joint positions; ``"direct"``: oscillators are the
+    :param dt: time step [s]
+    :param control: ``"track"``: actuators track joint positions; ``"direct"``: oscillators are the
         commands
     :param names: of the actuated joints, in the order of the actuators
-    :param position: of each in ``qpos`` followed by ``qvel``; empty where nothing is tracked
-    :param velocity: of each in ``qpos`` followed by ``qvel``
-    :param seen_position: of each in the observation; empty if that does not have them all
-    :param seen_velocity: of each in the observation
-    :param lower: ends of their ranges, or of the commands
-    :param upper: the other ends
-    :param rest: where the model puts them at first, or the middle of the commands
+    :param lower: lower limit of each joint, or of each command
+    :param upper: upper limits
+    :param rest: positions at rest in the model, or the middle of each command's range
+    :param position: index of each position in ``qpos`` followed by ``qvel``; empty without tracking
+    :param velocity: index of each velocity in ``qpos`` followed by ``qvel``
+    :param seen_position: index of each position in the observation; empty unless all are observed
+    :param seen_velocity: index of each velocity in the observation
     """
 
     dt: float
     control: str
     names: tuple[str, ...]
-    position: tuple[int, ...]
-    velocity: tuple[int, ...]
-    seen_position: tuple[int, ...]
-    seen_velocity: tuple[int, ...]
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     rest: tuple[float, ...]
+    position: tuple[int, ...] = ()
+    velocity: tuple[int, ...] = ()
+    seen_position: tuple[int, ...] = ()
+    seen_velocity: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # JSON has lists only
@@ -61,7 +60,7 @@ class Robot:
                 object.__setattr__(self, field.name, tuple(value))
 
     def to_dict(self) -> dict[str, Any]:
-        """:return: plain data for JSON, from which ``Robot(**data)`` makes it again"""
+        """:return: JSON data, the arguments of an equal robot"""
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in dataclasses.asdict(self).items()
@@ -84,12 +83,13 @@ class Robot:
 
 def robot_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Robot:
     """
-    Resets the environment a few times to find out where in its observations the joints are.
+    Reset the environment a few times to locate the joints in its observations.
 
-    :param control: ``"track"``, ``"direct"``, or ``"auto"``: track where actuators drive joints
+    :param control: ``"track"``, ``"direct"``, or ``"auto"``: track if actuators drive joints
     :param joints: ``"observation"``, ``"env"``, or ``"auto"``: the observation if it has them all
-    :param dt: how long a step takes [s]; None: as the environment says
-    :raises EnvironmentMismatchError: if the environment does not have what is asked for
+    :param dt: time step [s]; None: that of the environment
+    :raises EnvironmentMismatchError: if the environment does not allow this control, or does not
+        show the joints there
     """
     attribute, error = functools.partial(_attribute, env), EnvironmentMismatchError
     interval = (
@@ -102,10 +102,6 @@ def robot_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Robot:
             dt=interval,
             control="direct",
             names=tuple(f"action[{i}]" for i in range(low.size)),
-            position=(),
-            velocity=(),
-            seen_position=(),
-            seen_velocity=(),
             lower=tuple(low.tolist()),
             upper=tuple(high.tolist()),
             rest=tuple((0.5 * (low + high)).tolist()),
@@ -183,7 +179,7 @@ def _commands(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
 def _in_observation(
     env: VecEnv, driven: ActuatedJoints
 ) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
-    """Entries of the observation that agree with the state at several resets, if there are all."""
+    """:return: indices of positions and velocities in the observation, if it has all of them"""
     space = env.observation_space
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         return None
@@ -195,7 +191,7 @@ def _in_observation(
     columns = []
     for truth in there:
         matches = np.abs(observed[:, :, None] - truth[:, None, :]).max(axis=0) < _EQUAL
-        # A joint that every reset puts at the same place cannot be told from other constants.
+        # A joint with the same state after every reset cannot be distinguished from constants.
         if not (matches.any(axis=0) & (np.ptp(truth, axis=0) > _EQUAL)).all():
             return None
         columns.append(tuple(np.argmax(matches, axis=0).tolist()))

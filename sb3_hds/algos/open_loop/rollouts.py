@@ -24,11 +24,11 @@ from sb3_hds.algos.open_loop.policy import OscillatorPolicy, Timetable
 
 class Trial(NamedTuple):
     """
-    One episode.
+    One episode of a gait.
 
-    :param row: of the gait
+    :param row: number of the gait
     :param seed: of the reset
-    :param place: where its return belongs
+    :param place: index of its return
     """
 
     row: int
@@ -38,13 +38,13 @@ class Trial(NamedTuple):
 
 class Trials:
     """
-    Runs episodes, as many at a time as the environment has copies. A copy that has nothing left to
-    try goes on moving until the others are done, and its steps count as all do.
+    Run episodes in all copies of the environment in parallel. Copies without further trials
+    continue to move until the others are done, and their steps count, too.
 
-    :param model: whose environment and counters these are
+    :param model: with the environment and the counters
     :param policy: that tracks the targets of a gait
     :param callback: called at every step
-    :param total_timesteps: at which to stop
+    :param total_timesteps: number of timesteps at which to stop
     """
 
     def __init__(
@@ -71,10 +71,10 @@ class Trials:
     ) -> bool:
         """
         :param gaits: one per row
-        :param trials: in whose order they start
-        :param keep: called with each that is over and its return
-        :param horizon: steps after which an episode is cut off, where single copies can be reset
-        :return: whether all are over; otherwise the steps were used up, or the callback said stop
+        :param trials: in the order of their starts
+        :param keep: called with each completed trial and its return
+        :param horizon: steps after which an episode is truncated, if single copies can be reset
+        :return: whether all trials are complete; False: no more timesteps, or the callback stopped
         """
         assert self._policy.robot is not None
         timetable, waiting = Timetable(gaits, self._policy.robot.dt), deque(trials)
@@ -98,7 +98,7 @@ class Trials:
         return True
 
     def _start(self, copy: int, waiting: deque[Trial]) -> Trial | None:
-        """Reset one copy for the next trial, if there is one."""
+        """Reset a copy of the environment for the next trial, if there is one."""
         self._steps[copy], self._returns[copy] = 0, 0.0
         if not waiting:
             return None
@@ -112,7 +112,7 @@ class Trials:
         return trial
 
     def _step(self, targets: np.ndarray, kp: np.ndarray, kd: np.ndarray) -> bool:
-        """:return: whether to go on"""
+        """:return: whether to continue"""
         model, callback = self._model, self._callback
         if model.num_timesteps >= self._total:
             return False
@@ -129,7 +129,8 @@ class Trials:
         model.num_timesteps += self._env.num_envs
         callback.update_locals(locals())
         going = callback.on_step()
-        model._last_obs = _owned(new_obs)  # type: ignore[assignment]
+        # Some environments step into the array that they returned before.
+        model._last_obs = new_obs.copy() if isinstance(new_obs, np.ndarray) else new_obs  # type: ignore[assignment]
         model._update_info_buffer(infos, dones)
         total = model._total_timesteps
         model._update_current_progress_remaining(model.num_timesteps, total)
@@ -140,7 +141,7 @@ class Trials:
 
 
 def can_reset_one(env: VecEnv) -> bool:
-    """:return: whether a single copy can be reset, with a seed, and nothing above it minds"""
+    """:return: whether a single copy can be reset with a seed, in spite of all wrappers"""
     while isinstance(env, VecEnvWrapper):
         if isinstance(env, VecFrameStack | VecExtractDictObs):
             return False
@@ -149,15 +150,10 @@ def can_reset_one(env: VecEnv) -> bool:
 
 
 def _forget_episode(env: Any, copy: int) -> None:
-    """What wrappers above have added up of an episode that was cut off is none of the next one."""
+    """Reset what wrappers have accumulated of a truncated episode."""
     while isinstance(env, VecEnvWrapper):
         if isinstance(env, VecMonitor):
             env.episode_returns[copy], env.episode_lengths[copy] = 0.0, 0
         elif isinstance(env, VecNormalize):
             env.returns[copy] = 0.0
         env = env.venv
-
-
-def _owned(observation: Any) -> Any:
-    """Some environments step into the array that they returned before."""
-    return observation.copy() if isinstance(observation, np.ndarray) else observation

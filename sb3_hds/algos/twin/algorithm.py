@@ -1,16 +1,16 @@
 """
-The shell of every algorithm that plans in a twin.
+What the algorithms that plan in a twin share.
 
-SB3 collects real steps and calls ``train``; a call of ``train`` is one planning epoch in the twin
-(the pure functions in ``epoch.py``). A timestep is a step of the environment that the user passed
-in, nothing else; simulated steps are counted apart.
+SB3 collects real steps and calls ``train``, which is one planning epoch in the twin (the pure
+functions in ``epoch.py``). Timesteps are steps of the user's environment only; simulated steps have
+their own counter.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 
 from sb3_hds.algos.base.algorithm import TensorAlgorithm
 from sb3_hds.algos.base.construct import callbacks_of, jax_device
-from sb3_hds.algos.twin.config import TwinConfig, epoch_config, hyperparams
+from sb3_hds.algos.twin.config import TwinConfig, epoch_config
 from sb3_hds.algos.twin.epoch import EpochMetrics, epoch, epoch_log, programs, twin_steps_per_epoch
 from sb3_hds.algos.twin.model import (
     Tensors,
@@ -35,7 +35,7 @@ from sb3_hds.algos.twin.model import (
     view_of,
 )
 from sb3_hds.algos.twin.policy import TwinPolicy, all_finite
-from sb3_hds.algos.twin.pretraining import Pretraining, beside, meanwhile, nothing
+from sb3_hds.algos.twin.pretraining import Pretraining, no_poll, run_in_thread, run_in_threads
 from sb3_hds.algos.twin.regression import (
     choose_policy,
     comparison,
@@ -45,6 +45,7 @@ from sb3_hds.algos.twin.regression import (
 from sb3_hds.algos.twin.state import (
     EpochConfig,
     EpochState,
+    Hyperparams,
     Workspace,
     init_workspace,
     longest_episode,
@@ -55,15 +56,16 @@ from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.envs.mirror import check_mirrors, twin_of
 from sb3_hds.errors import DivergedError
 
-# Decay of what counts as recent in the pretraining, per epoch, and the fewest epochs before it may
-# end early.
+# Decay per epoch of the running means that end the pretraining early, and the fewest epochs before.
 _RECENT = 0.9
 _FEWEST_EPOCHS = 20
+# Factor on the temperature of the annealed acceptance after each epoch: below 1 % after fifty.
+_TEMPERATURE_DECAY = 0.9
 
 
 class TwinAlgorithm(TensorAlgorithm):
     """
-    Abstract: what PODS and HDS share.
+    Abstract: base of PODS and HDS.
 
     ``learn`` runs the planning epochs of the pretraining (``pretraining.py``), then SB3 alternates
     between real steps and :meth:`train`. Both call :meth:`run_epoch`: ``epoch`` (``epoch.py``)
@@ -76,7 +78,7 @@ class TwinAlgorithm(TensorAlgorithm):
     config_class = TwinConfig
     policy: TwinPolicy
     twin: Twin | None
-    #: the twin contains the layers, so its inputs are the actions before them
+    #: the twin contains the wrappers, so its inputs are the actions before them
     stores_executed: ClassVar[bool] = False
     check_observations = staticmethod(check_twin_observes)
 
@@ -84,48 +86,23 @@ class TwinAlgorithm(TensorAlgorithm):
         config = dataclasses.replace(config, twin=twin_given(config.twin))
         super().construct(config, sde_support=False, **more)
         self.twin_spec: dict[str, Any] | None = None
-        # Running means over epochs of the pretraining, which ends where plans gain nothing more.
+        # Running means over epochs of the pretraining, which ends when plans stop gaining.
         self.recent_gain, self.recent_return = 0.0, 0.0
         self.n_pretrained = 0
-        # A step that callbacks have seen and the replay buffer does not have yet.
+        # A step that was passed to callbacks and not yet added to the replay buffer.
         self.unstored_step: dict[str, Any] | None = None
         self.real_timesteps, self.twin_timesteps = 0, 0
         self.learned_force = Tensors(self)
         self._n_updates = 0
-        # Of this call of ``learn``.
+        # In the current call of ``learn``.
         self._epochs_planned, self._epochs_done = 0, 0
         self._workspace: Workspace | None = None
-        # What programs are compiled for, and the comparison of policies while it compiles.
+        # Config of the compiled programs, and the comparison of policies while it compiles.
         self._compiled: EpochConfig | None = None
         self._comparison: Callable[[], Any] | None = None
-        # Whether a callback ended the training, and what is called while programs compile.
+        # Whether a callback ended the training, and a function to call while programs compile.
         self.stopped = False
-        self.poll: Callable[[], None] = nothing
-
-    def learn(  # type: ignore[override]
-        self,
-        total_timesteps: int | None = None,
-        callback: MaybeCallback = None,
-        log_interval: int | None = 4,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> Self:
-        """
-        Plan in the twin until the pretraining is done, then act in the environment and plan on.
-
-        :param total_timesteps: steps of the *environment*; default ``default_timesteps``. With 0,
-            only the pretraining runs, and the environment is not stepped.
-        :param callback: called at every step of the environment, and before the first one after
-            every planning epoch, with ``locals["pretraining"]`` and no timestep counted
-        :param log_interval: episodes between two log lines
-        :param tb_log_name: name of the run for TensorBoard; default: the class's name
-        :param reset_num_timesteps: False goes on counting
-        :param progress_bar: show one for planning and one for acting
-        """
-        return super().learn(
-            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
-        )
+        self.poll: Callable[[], None] = no_poll
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """One planning epoch with ``gradient_steps`` regression steps, between real steps."""
@@ -134,7 +111,7 @@ class TwinAlgorithm(TensorAlgorithm):
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         if self.stopped:
-            # By a callback, before the first step.
+            # A callback ended the training before the first step.
             return RolloutReturn(0, 0, continue_training=False)
         return super().collect_rollouts(*args, **kwargs)
 
@@ -153,33 +130,29 @@ class TwinAlgorithm(TensorAlgorithm):
 
     def run_epoch(self, gradient_steps: int) -> EpochMetrics:
         """
-        Improve plans in the twin and regress the policy on them, once.
+        One planning epoch: improve plans in the twin and regress the policy on them.
 
         :param gradient_steps: regression steps
-        :return: what happened, on the device
+        :return: metrics, on the device
         :raises NoTwinError: if the model was loaded without environment and without twin
-        :raises DivergedError: if the regression diverged; the model keeps its last good state
+        :raises DivergedError: if the regression diverged; the model keeps its last finite state
         """
-        state, program, config = self._epoch_state(), self._program, self.config
-        every, view = config.refinements.compare_every, self._view(program.twin)
-        rate = self.lr_schedule(self._progress_remaining())
+        state, program = self._epoch_state(), self._program
+        every = self.config.refinements.compare_every
         n_epochs = int(self.policy.progress.n_epochs)
-        varied = self.varied(program.twin)
-        hyper = hyperparams(
-            config, n_epochs, rate, gradient_steps, program.twin.params, varied, view
-        )
+        hyper = self.hyperparams(program.twin, gradient_steps)
         if program != self._compiled:
-            meanwhile(programs(program, state, hyper), self.poll)
+            run_in_threads(programs(program, state, hyper), self.poll)
             self._compiled, self._comparison = program, None
-        # The first comparison is some epochs away: its program is compiled beside them.
+        # Compile the comparison in another thread during the epochs before it is due.
         ahead = max(1, self._epochs_planned - self._epochs_done)
         compares = every > 0 and (self.comparison_due or n_epochs % every + ahead >= every)
         if compares and self._comparison is None:
-            self._comparison = beside(comparison(program, state, hyper)).result
+            self._comparison = run_in_thread(comparison(program, state, hyper)).result
         state, metrics = epoch(program, state, hyper)
         if self._comparison and is_compared(n_epochs + 1, every, self.comparison_due):
-            meanwhile([self._comparison], self.poll)
-            self._comparison = nothing
+            run_in_threads([self._comparison], self.poll)
+            self._comparison = no_poll
         state, returns = choose_policy(program, state, hyper, every, self.comparison_due)
         losses = float(metrics.policy_loss), float(metrics.value_loss)
         if not (all(map(math.isfinite, losses)) and all_finite(state.networks)):
@@ -200,16 +173,34 @@ class TwinAlgorithm(TensorAlgorithm):
         self.logger.record("time/twin_timesteps", self.twin_timesteps)
         return metrics
 
+    def hyperparams(self, twin: Twin, gradient_steps: int) -> Hyperparams:
+        """:return: the hyperparameters of the next epoch, which may change without recompiling"""
+        config, n_epochs = self.config, int(self.policy.progress.n_epochs)
+        how = config.refinements
+        return Hyperparams(
+            params=twin.params,
+            varied=self.varied(twin),
+            learning_rate=self.lr_schedule(self._progress_remaining()),
+            noise=config.exploration_noise * config.exploration_decay**n_epochs,
+            temperature=config.temperature * _TEMPERATURE_DECAY**n_epochs,
+            reset_share=config.reset_share,
+            gain_weight=how.gain_weight,
+            sensitivity_weight=how.sensitivity_weight,
+            averaging=how.averaging,
+            gradient_steps=gradient_steps,
+            view=self._view(twin),
+        )
+
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
-        :param env: has the spaces of the one before, as many copies, and a twin
-        :param force_reset: False goes on from where the environment is
-        :raises NoTwinError: if it has no twin; the model then keeps the environment that it had
+        :param env: an environment with a twin, the same spaces and the same number of copies
+        :param force_reset: False continues from the environment's current state
+        :raises NoTwinError: if it has no twin; the model then keeps its environment
         """
         before = self.env, self.n_envs, self._vec_normalize_env, self._last_obs
         super().set_env(env, force_reset)
         try:
-            self._meet_env()
+            self._match_env()
         except Exception:
             self.env, self.n_envs, self._vec_normalize_env, self._last_obs = before
             raise
@@ -234,7 +225,7 @@ class TwinAlgorithm(TensorAlgorithm):
         ]
 
     def _setup_twin(self) -> None:
-        """The twin that was passed, or saved because it had been, or the environment's own."""
+        """Set the twin: the one that was passed, or had been when saved, or the environment's."""
         given: Any = self.twin  # a name, where one was passed to `load`
         if given is not None and not isinstance(given, Twin):
             self.twin = twin_given(given)
@@ -242,9 +233,9 @@ class TwinAlgorithm(TensorAlgorithm):
             self.twin = twin_from_spec(self.twin_spec)
         if self.twin is not None:
             self.twin_spec = self.twin.to_spec()
-        self._meet_env()
+        self._match_env()
 
-    def _meet_env(self) -> None:
+    def _match_env(self) -> None:
         """Plan with the twin of the environment, unless one was passed."""
         twin = self.twin
         if self.env is not None:
@@ -255,18 +246,18 @@ class TwinAlgorithm(TensorAlgorithm):
         if twin is not None:
             check_methods(twin)
             check_reward(twin)
-            twin = self._prepared(twin)
+            twin = self._prepare_twin(twin)
             if self.twin is not None and (twin != self.twin or twin.values != self.twin.values):
                 self._workspace = None
         self.twin = twin
 
-    def _prepared(self, twin: Twin) -> Twin:
-        """:return: what to plan in, given the twin of the environment or the one that was passed"""
+    def _prepare_twin(self, twin: Twin) -> Twin:
+        """:return: the twin to plan in, given the environment's twin or the one that was passed"""
         return twin
 
     @property
     def comparison_due(self) -> bool:
-        """Whether policies are compared after this epoch, whatever ``compare_every`` says."""
+        """Whether policies are compared after this epoch regardless of ``compare_every``."""
         return False
 
     def varied(self, twin: Twin) -> Params:
@@ -289,14 +280,14 @@ class TwinAlgorithm(TensorAlgorithm):
 
     @property
     def _program(self) -> EpochConfig:
-        """What an epoch is compiled for."""
+        """Static configuration of an epoch."""
         return epoch_config(self.config, self.policy, required(self.twin, self.twin_spec))
 
     def _view(self, twin: Twin) -> Any:
         return view_of(self.get_vec_normalize_env(), len(twin.channels))
 
     def _epoch_state(self) -> EpochState:
-        """What an epoch changes. Before the first one, the scales of the task are found."""
+        """The state that an epoch changes; before the first one, find the scales of the task."""
         program, policy = self._program, self.policy
         workspace = self._workspace
         if workspace is None:
@@ -306,7 +297,7 @@ class TwinAlgorithm(TensorAlgorithm):
                 prepare_statistics(self._vec_normalize_env, program.twin, jax.random.key(seed))
             view, params = self._view(program.twin), program.twin.params
             started = partial(init_workspace, program, params, view, policy.progress)
-            [(workspace, scales, progress)] = meanwhile([started], self.poll)
+            [(workspace, scales, progress)] = run_in_threads([started], self.poll)
             if fresh:
                 policy.networks = policy.networks._replace(inside=scales.inside)
                 progress = progress._replace(
@@ -330,7 +321,7 @@ class TwinAlgorithm(TensorAlgorithm):
 
     @property
     def _steps_per_epoch(self) -> int:
-        """Real steps between two epochs; where ``train_freq`` counts episodes, the most."""
+        """Real steps between two epochs; the most there can be if ``train_freq`` is in episodes."""
         assert isinstance(self.train_freq, TrainFreq)
         if self.train_freq.unit.value == "step":
             return self.train_freq.frequency * self.n_envs
@@ -338,7 +329,7 @@ class TwinAlgorithm(TensorAlgorithm):
 
     @property
     def pretraining_due(self) -> int:
-        """Planning epochs that are left to do before the next real step."""
+        """Number of remaining planning epochs before the next real step."""
         config = self.config
         enough = config.refinements.least_gain * self.recent_return
         if self.n_pretrained >= _FEWEST_EPOCHS and self.recent_gain < enough:
@@ -347,13 +338,13 @@ class TwinAlgorithm(TensorAlgorithm):
 
     def pretrain_epoch(self) -> None:
         """
-        One planning epoch before the first real step, like any other. Where plans gain nothing
-        more, it is the last one, and schedules jump over those that are spared.
+        One planning epoch before the first real step. If plans stop gaining, it is the last one,
+        and schedules skip the epochs that are left out.
         """
         planned = self.pretraining_due
         steps = self.gradient_steps if self.gradient_steps >= 0 else self._steps_per_epoch
-        metrics = self.run_epoch(steps)
-        before, after = float(metrics.before), float(metrics.after)
+        plans = self.run_epoch(steps).plans
+        before, after = float(plans.before), float(plans.after)
         self.recent_gain = _RECENT * self.recent_gain + max(0.0, after - before)
         self.recent_return = _RECENT * self.recent_return + abs(before)
         self.n_pretrained += 1

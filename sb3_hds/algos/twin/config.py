@@ -1,4 +1,4 @@
-"""Arguments of the algorithms that plan in a twin, and what an epoch reads of them."""
+"""Arguments of the algorithms that plan in a twin, and the epoch's static configuration."""
 
 import dataclasses
 import math
@@ -9,52 +9,44 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_hds.algos.base.config import OffPolicyConfig, Rate, between
 from sb3_hds.algos.twin.policy import TwinPolicy
-from sb3_hds.algos.twin.state import EpochConfig, Hyperparams, View
-from sb3_hds.core import Params, Twin
+from sb3_hds.algos.twin.state import EpochConfig
+from sb3_hds.core import Twin
+from sb3_hds.planning import METHODS
 
-PLANNERS = ("first_order", "gauss_newton", "ilqr")
-LOSSES = ("smooth_absolute", "squared")
-
-# A plan looks this far ahead where the horizon is derived [s], within these numbers of steps.
+# Default horizon [s], and its limits [steps].
 _HORIZON = 0.6
 _SHORTEST, _LONGEST = 12, 32
-# How many horizons the policy is followed beyond the end of a plan, where that is derived.
+# Default lookahead, in horizons.
 _LOOKAHEAD = 5
-# Share of start states for which random plans are tried: they are as expensive as the policy's own,
-# and a local optimum that half of the rollouts avoid is no longer what the policy learns.
-_RANDOM_SHARE = 0.5
-# Factor on the temperature of the annealed acceptance after each epoch: after the first fifty, it
-# is below 1 % of what it was.
-_TEMPERATURE_DECAY = 0.9
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Refinements:
     """
-    How plans are improved and learned from. They are arguments of PODS, so that the setting of its
-    paper can be reached; HDS uses the defaults, which ``benchmarks/payload.py`` compares with the
-    paper's.
+    How plans are improved and learned from. These are arguments of PODS, so that the paper's
+    settings can be reproduced; HDS uses the defaults, which ``benchmarks/payload.py`` compares with
+    the paper's.
 
-    :param n_iterations: improvements of each plan in an epoch (the paper: 1)
+    :param n_iterations: improvements of each plan per epoch (the paper: 1)
     :param n_step_sizes: candidates of each line search, "no change" included
-    :param plan_memory: epochs whose plans are learned from (the paper: 1)
-    :param learned_share: share of each plan, from its start, that the policy learns from: what a
-        plan does at its end depends most on the learned value (the paper: 1)
+    :param plan_memory: number of latest epochs whose plans are learned from (the paper: 1)
+    :param learned_share: share of each plan, from its start, that the policy learns from: the end
+        of a plan depends most on the learned value (the paper: 1)
     :param loss: ``"smooth_absolute"``, in units of the typical control, or ``"squared"`` (the
-        paper); see :func:`~sb3_hds.algos.twin.regression.regress_policy`
-    :param gain_weight: 0..1, how much a sample counts in proportion to what its plan gained over
-        the policy (the paper: 0)
-    :param sensitivity_weight: 0..1, how much it counts in proportion to what an error of its
-        control costs; only with ``"ilqr"`` (the paper: 0)
-    :param averaging: decay per epoch of the average of policies (the paper: 0)
+        paper); see :func:`~sb3_hds.algos.twin.regression.learn_policy`
+    :param gain_weight: 0..1, share of a sample's weight that is proportional to the gain of its
+        plan over the policy (the paper: 0)
+    :param sensitivity_weight: 0..1, share of a sample's weight that is proportional to the cost of
+        an error in its control; only with ``"ilqr"`` (the paper: 0)
+    :param averaging: decay per epoch of the moving average of policies (the paper: 0)
     :param adapt_scales: whether the scales of the networks' inputs and of the regression's errors
-        follow the plans (near a balance both are far smaller than in random rollouts); False keeps
+        follow the plans (near a balance, both are far smaller than in random rollouts); False keeps
         those of the first rollouts
-    :param compare_every: epochs after which the averaged policy and the one that acts are compared
-        on whole episodes of the twin, and the better one acts from then on; 0: the averaged policy
-        acts (the paper)
-    :param least_gain: the pretraining ends when plans have gained less than this share of the
-        policy's return, averaged over about ten epochs; 0: never
+    :param compare_every: epochs between two comparisons of the averaged policy with the acting one
+        on full episodes of the twin, after which the better one acts; 0: the averaged policy acts
+        (the paper)
+    :param least_gain: the pretraining ends when the gain of plans, averaged over about ten epochs,
+        is less than this share of the policy's return; 0: never
     """
 
     n_iterations: int = 3
@@ -78,32 +70,32 @@ class TwinConfig(OffPolicyConfig):
     :param env: an environment with a twin, its id, or a vectorised environment
     :param learning_rate: of policy and value, per Adam step; a schedule runs over all planning
         epochs, pretraining included. Own choice, measured.
-    :param buffer_size: real transitions that are kept
+    :param buffer_size: capacity of the replay buffer [real transitions]
     :param learning_starts: real steps with random actions before the policy acts
     :param batch_size: states per regression step
     :param train_freq: real steps between two planning epochs, or ``(n, "episode")``
-    :param gradient_steps: regression steps per planning epoch; -1: as many as real steps were made
-        (the paper: 50)
+    :param gradient_steps: regression steps per planning epoch; -1: as many as real steps since the
+        last epoch (the paper: 50)
     :param action_noise: added to the actions in the real environment
-    :param twin: the simulation to plan in, or its name; None: the one that mirrors the environment.
-        Pass a different one to learn in a model that is wrong on purpose.
+    :param twin: the simulation to plan in, or its name; None: the environment's twin. Pass another
+        one to learn in a model that is wrong on purpose.
     :param pretrain_epochs: planning epochs before the first real step
-    :param n_rollouts: start states planned from in each epoch (the paper: 4000)
-    :param horizon: steps of a plan; None: 0.6 s, between 12 and 32 steps (the paper: the whole
+    :param n_rollouts: start states per epoch, each with a plan (the paper: 4000)
+    :param horizon: steps of a plan; None: 0.6 s, between 12 and 32 steps (the paper: the full
         episode of 100)
     :param planner: ``"ilqr"``: second-order steps with feedback and limits on the controls;
         ``"gauss_newton"``: the paper's open-loop second-order step; ``"first_order"``: gradient of
         the action sequence
-    :param n_random_plans: random sequences of which the best is also improved, for half of the
-        start states, against local optima; 0 switches it off (the paper)
-    :param lookahead: steps for which the policy is rolled out beyond the end of a plan when plans
-        are compared; None: five horizons; 0 switches it off (the paper)
+    :param n_random_plans: random sequences per start state, for half of the start states; the best
+        of them is improved, too, against local optima; 0: none (the paper)
+    :param lookahead: steps of the policy beyond the end of a plan, simulated to compare plans;
+        None: five horizons; 0: none (the paper)
     :param terminal_value: whether a learned value is added at the end of a plan (the paper: no)
     :param shift_ends: whether a terminated episode counts as one that earns zero reward for ever.
-        The best reward seen is subtracted from all rewards; without the shift, termination is worth
-        zero on that scale, and terminating early pays.
+        Planning subtracts the best observed reward from all rewards; without the shift, termination
+        has the value zero on that scale, and terminating early pays.
     :param reset_share: share of start states drawn from the reset distribution in each epoch; the
-        others are advanced by the policy (the paper: 1)
+        policy advances the others (the paper: 1)
     :param exploration_noise: standard deviation of a constant offset of the controls while start
         states are advanced, in units of the typical size of the plans' controls
     :param randomisation: domain randomisation: standard deviation of the twin's parameters between
@@ -150,7 +142,7 @@ class TwinConfig(OffPolicyConfig):
         self.require_range(0.0, math.inf, "a finite number of at least 0", *non_negative)
         fine = between(self.gamma, 0.0, 1.0) and self.gamma > 0.0
         self.require(fine, "gamma", "a number above 0 and at most 1")
-        self.require_choice("planner", PLANNERS)
+        self.require_choice("planner", list(METHODS))
 
     @property
     def refinements(self) -> Refinements:
@@ -170,7 +162,7 @@ class PODSConfig(Refinements, TwinConfig):
         shares = ("learned_share", "gain_weight", "sensitivity_weight", "averaging")
         self.require_range(0.0, 1.0, "a number from 0 to 1", *shares)
         self.require_range(0.0, math.inf, "a finite number of at least 0", "least_gain")
-        self.require_choice("loss", LOSSES)
+        self.require_choice("loss", ("smooth_absolute", "squared"))
 
     @property
     def refinements(self) -> Refinements:
@@ -179,8 +171,8 @@ class PODSConfig(Refinements, TwinConfig):
 
 def epoch_config(config: TwinConfig, policy: TwinPolicy, twin: Twin) -> EpochConfig:
     """
-    :param twin: to plan in; the horizon is derived from its time step, unless one was passed
-    :return: what an epoch is compiled for
+    :param twin: to plan in; its time step determines the default horizon
+    :return: static configuration of an epoch
     """
     horizon = config.horizon or int(np.clip(round(_HORIZON / twin.dt), _SHORTEST, _LONGEST))
     how = config.refinements
@@ -196,7 +188,6 @@ def epoch_config(config: TwinConfig, policy: TwinPolicy, twin: Twin) -> EpochCon
         n_iterations=how.n_iterations,
         n_step_sizes=how.n_step_sizes,
         n_candidates=config.n_random_plans,
-        random_share=_RANDOM_SHARE,
         discount=config.gamma,
         terminal_value=config.terminal_value,
         shift_ends=config.shift_ends,
@@ -207,37 +198,4 @@ def epoch_config(config: TwinConfig, policy: TwinPolicy, twin: Twin) -> EpochCon
         max_grad_norm=policy.max_grad_norm,
         annealed=config.temperature > 0.0,
         adapt_scales=how.adapt_scales,
-    )
-
-
-def hyperparams(
-    config: TwinConfig,
-    n_epochs: int,
-    learning_rate: float,
-    gradient_steps: int,
-    params: Params,
-    varied: Params,
-    view: View,
-) -> Hyperparams:
-    """
-    :param n_epochs: that were done
-    :param learning_rate: of this epoch
-    :param params: the twin's parameters
-    :param varied: those of them that differ between rollouts, each of shape ``(n_rollouts,)``
-    :param view: what the environment's own normalisation does to an observation
-    :return: what this epoch works with, without compiling again
-    """
-    how = config.refinements
-    return Hyperparams(
-        params=params,
-        varied=varied,
-        learning_rate=learning_rate,
-        noise=config.exploration_noise * config.exploration_decay**n_epochs,
-        temperature=config.temperature * _TEMPERATURE_DECAY**n_epochs,
-        reset_share=config.reset_share,
-        gain_weight=how.gain_weight,
-        sensitivity_weight=how.sensitivity_weight,
-        averaging=how.averaging,
-        gradient_steps=gradient_steps,
-        view=view,
     )

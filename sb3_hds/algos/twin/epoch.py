@@ -1,8 +1,8 @@
 """
-One planning epoch as a pure function: roll the policy out in the twin, improve the plans, keep what
-is better, regress the policy on it, move on.
+One planning epoch as a pure function: roll the policy out in the twin, improve the plans, keep the
+better ones, regress the policy on them, advance the start states.
 
-The stateful shell around it is ``algorithm.py``. Nothing here knows an environment's name.
+``algorithm.py`` holds the state. Nothing here is specific to an environment.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sb3_hds.algos.twin.networks import output
+from sb3_hds.algos.twin.policy import output
 from sb3_hds.algos.twin.regression import (
     learn_from_plans,
     regressions,
@@ -26,35 +26,29 @@ from sb3_hds.algos.twin.state import (
     EpochConfig,
     EpochState,
     Hyperparams,
-    for_each,
+    grouped_vmap,
     longest_episode,
-    problem_of,
+    planning_problem,
     resets,
 )
 from sb3_hds.core import Obs, Params, State
 from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION
-from sb3_hds.planning import (
-    Plan,
-    Problem,
-    best_of_random,
-    follow,
-    gauss_newton,
-    gradient_ascent,
-    ilqr,
-    score,
-)
+from sb3_hds.planning import METHODS, Plan, Problem, best_of_random, follow, ilqr, score
 from sb3_hds.planning.problem import Control
 
-# By this much, in units of the objective, the plan that began as the policy's own is preferred.
+# Advantage of plans that start from the policy's own over random ones, in units of the objective.
 _TIE = 1e-3
+# Share of start states with random plans: they cost as much as the policy's own plans, and the
+# policy does not learn a local optimum that half of the rollouts avoid.
+_RANDOM_SHARE = 0.5
 
 
 class Outcome(NamedTuple):
     """
-    What came of planning. Returns are discounted planning rewards, in the reward's own unit.
+    Metrics of planning. Returns are discounted planning rewards, in the reward's own unit.
 
     :param before: mean return of the policy's own plans
-    :param after: mean return of the plans that were kept
+    :param after: mean return of the kept plans
     :param worsened: number of kept plans that are worse than the policy's own
     :param dropped: number of samples that were not finite
     """
@@ -67,17 +61,15 @@ class Outcome(NamedTuple):
 
 class EpochMetrics(NamedTuple):
     """
-    What an epoch tells: its :class:`Outcome`, and
+    Metrics of an epoch.
 
-    :param policy_loss: mean regression loss of the epoch
+    :param plans: metrics of planning
+    :param policy_loss: mean regression loss of the policy
     :param value_loss: mean regression loss of the value
     :param gradient_norm: mean norm of the policy's gradient before it is clipped
     """
 
-    before: jax.Array
-    after: jax.Array
-    worsened: jax.Array
-    dropped: jax.Array
+    plans: Outcome
     policy_loss: jax.Array
     value_loss: jax.Array
     gradient_norm: jax.Array
@@ -87,10 +79,10 @@ class Choice(NamedTuple):
     """
     The plans of one epoch; leaves of shape ``(n_rollouts, ...)``.
 
-    :param own: what the policy does
-    :param kept: what is learned from
-    :param tails: value of the last state of ``kept``
-    :param sensitivity: cost of an error of each control of ``kept``
+    :param own: rollouts of the policy
+    :param kept: plans to learn from
+    :param tails: value of the last state of each plan in ``kept``
+    :param sensitivity: cost of an error in each control of ``kept``
     """
 
     own: Plan
@@ -103,24 +95,21 @@ def epoch(
     config: EpochConfig, state: EpochState, hyper: Hyperparams
 ) -> tuple[EpochState, EpochMetrics]:
     """
-    Plan from every start state, keep what is better than the policy, regress on it, move on.
+    Plan from every start state, keep plans that are better than the policy, regress on them.
 
-    :return: the state after the epoch, and what happened
+    :return: the state after the epoch, and its metrics
     """
     state, outcome = plan_ahead(config, state, hyper)
     state, losses = learn_from_plans(config, state, hyper)
-    of_policy, of_value, norm = losses
-    return state, EpochMetrics(
-        *outcome, policy_loss=of_policy, value_loss=of_value, gradient_norm=norm
-    )
+    return state, EpochMetrics(outcome, *losses)
 
 
 def epoch_log(
     metrics: EpochMetrics, hyper: Hyperparams, returns: Float[np.ndarray, " 2"] | None
 ) -> dict[str, float]:
     """
-    :param returns: of the average policy and of the one that acted so far, if they were compared
-    :return: what an epoch logs, by key
+    :param returns: of the averaged policy and of the one that acted so far, if they were compared
+    :return: logged values by key
     """
     compared = {}
     if returns is not None:
@@ -128,13 +117,13 @@ def epoch_log(
         compared["train/return_of_best"] = float(max(returns))
     return compared | {
         "train/learning_rate": hyper.learning_rate,
-        "train/plan_return_before": float(metrics.before),
-        "train/plan_return_after": float(metrics.after),
+        "train/plan_return_before": float(metrics.plans.before),
+        "train/plan_return_after": float(metrics.plans.after),
         "train/policy_loss": float(metrics.policy_loss),
         "train/value_loss": float(metrics.value_loss),
         "train/gradient_norm": float(metrics.gradient_norm),
-        "train/worsened_plans": int(metrics.worsened),
-        "train/dropped_samples": int(metrics.dropped),
+        "train/worsened_plans": int(metrics.plans.worsened),
+        "train/dropped_samples": int(metrics.plans.dropped),
         "train/exploration_noise": hyper.noise,
         "train/temperature": hyper.temperature,
     }
@@ -144,18 +133,18 @@ def epoch_log(
 def plan_ahead(
     config: EpochConfig, state: EpochState, hyper: Hyperparams
 ) -> tuple[EpochState, Outcome]:
-    """The first half of an epoch: everything that happens in the twin."""
+    """The first half of an epoch: rollouts and planning in the twin."""
     key = jax.random.wrap_key_data(state.progress.key, impl=GENERATOR)
     key, k_noise, k_plan, k_move = jax.random.split(key, 4)
-    problem = problem_of(config, state, hyper)
+    problem = planning_problem(config, state, hyper)
     starts = state.workspace.starts
-    own, wandering = _act(config, state, hyper, problem, starts, k_noise)
+    own, exploring = _roll_out(config, state, hyper, problem, starts, k_noise)
     choice = _plan(config, state, hyper, problem, own, k_plan)
     gain = jnp.maximum(choice.kept.value - choice.own.value, 0.0)
     samples, finite = samples_of(
         hyper, problem, choice.kept, choice.tails, gain, choice.sensitivity
     )
-    moved, ages = _move_on(config, state, hyper, wandering, k_move)
+    moved, ages = _advance_starts(config, state, hyper, exploring, k_move)
     outcome = _outcome(config, state, choice, finite)
     state = remember(config, state, samples)
     if config.adapt_scales:
@@ -166,15 +155,15 @@ def plan_ahead(
 
 
 def control_of(config: EpochConfig, state: EpochState, hyper: Hyperparams, obs: Obs) -> Control:
-    """:return: what the policy in training does for an observation of the twin"""
+    """:return: control of the policy in training for an observation of the twin"""
     seen = state.networks.inside(hyper.view(obs))
     return output(config.actor, state.networks.actor, seen)
 
 
 def twin_steps_per_epoch(config: EpochConfig) -> int:
     """
-    :return: simulated steps of one epoch, line searches included; a Jacobian counts one step for
-        each of its columns besides the step itself, as many as finite differences would take
+    :return: simulated steps of one epoch, line searches included; a Jacobian counts as many steps
+        as finite differences would take, one per column and the step itself
     """
     s = config
     columns = 2 * len(s.twin.joints) + len(s.twin.actuators)
@@ -185,7 +174,7 @@ def twin_steps_per_epoch(config: EpochConfig) -> int:
     return acting + planning + (2 * n + n_random) * s.lookahead
 
 
-def _act(
+def _roll_out(
     config: EpochConfig,
     state: EpochState,
     hyper: Hyperparams,
@@ -193,7 +182,7 @@ def _act(
     starts: State,
     key: PRNGKeyArray,
 ) -> tuple[Plan, Plan]:
-    """What the policy does from each start state, and what it does with exploration noise."""
+    """:return: rollouts of the policy from each start state, without and with exploration noise"""
     policy = partial(control_of, config, state, hyper)
 
     def act(start: State, offset: Control, varied: Params) -> Plan:
@@ -204,11 +193,11 @@ def _act(
     noise = hyper.noise * state.progress.control_scale
     offsets = noise * jax.random.normal(key, (n, problem.n_controls))
     if not config.advance:
-        own = for_each(act, starts, jnp.zeros_like(offsets), hyper.varied)
+        own = grouped_vmap(act, starts, jnp.zeros_like(offsets), hyper.varied)
         return own, own
-    rows, varied = _joined(starts, starts), _joined(hyper.varied, hyper.varied)
-    paths = for_each(act, rows, jnp.concatenate([jnp.zeros_like(offsets), offsets]), varied)
-    return _pick(paths, slice(n)), _pick(paths, slice(n, None))
+    rows, varied = _concatenated(starts, starts), _concatenated(hyper.varied, hyper.varied)
+    paths = grouped_vmap(act, rows, jnp.concatenate([jnp.zeros_like(offsets), offsets]), varied)
+    return _rows(paths, slice(n)), _rows(paths, slice(n, None))
 
 
 def _plan(
@@ -219,49 +208,49 @@ def _plan(
     own: Plan,
     key: PRNGKeyArray,
 ) -> Choice:
-    """For each of the policy's own plans, the plan that is kept."""
+    """Improve the policy's own and random plans, and choose the plan to keep for each start."""
     k_random, k_improve, k_keep = jax.random.split(key, 3)
-    n, fresh = config.n_rollouts, _random_slots(config)
+    n, slots = config.n_rollouts, _random_slots(config)
     policy = partial(control_of, config, state, hyper)
-    first, tried = own, _pick(hyper.varied, fresh)
+    first, tried = own, _rows(hyper.varied, slots)
     varied = hyper.varied
-    if fresh.size:
-        # Without the barrier, XLA gathers again in every step of the loops.
-        starts = jax.tree.map(lambda leaf: leaf[fresh, 0], own.states)
+    if slots.size:
+        # Without the barrier, XLA repeats the gather in every step of the loops.
+        starts = jax.tree.map(lambda leaf: leaf[slots, 0], own.states)
         starts = jax.lax.optimization_barrier(starts)
 
         def search(start: State, key: PRNGKeyArray, varied: Params) -> Plan:
             here = problem.with_params(varied)
             return best_of_random(here, start, key, config.horizon, config.n_candidates)
 
-        found = jax.vmap(search)(starts, jax.random.split(k_random, fresh.size), tried)
-        first, varied = _joined(own, found), _joined(varied, tried)
+        found = jax.vmap(search)(starts, jax.random.split(k_random, slots.size), tried)
+        first, varied = _concatenated(own, found), _concatenated(varied, tried)
     improved, sensitivity = _improve(config, state, hyper, problem, first, varied, k_improve)
 
-    plans, varied = _joined(improved, own), _joined(varied, hyper.varied)
+    plans, varied = _concatenated(improved, own), _concatenated(varied, hyper.varied)
     ends = jax.tree.map(lambda leaf: leaf[:, -1], plans.states)
     value_of_end = lambda end, own: _tail(config, problem.with_params(own), policy, end)  # noqa: E731
-    tails = for_each(value_of_end, ends, varied)
+    tails = grouped_vmap(value_of_end, ends, varied)
     values = jax.vmap(lambda p, tail: score(problem, p.rewards, p.alive, tail))(plans, tails)
     plans = plans._replace(value=values)
 
-    others = n + np.arange(fresh.size)
-    better = values[others] > values[fresh] + _TIE
-    best = jnp.arange(n).at[fresh].set(jnp.where(better, others, fresh))
-    unchanged = n + fresh.size + jnp.arange(n)
+    random_plans = n + np.arange(slots.size)
+    better = values[random_plans] > values[slots] + _TIE
+    best = jnp.arange(n).at[slots].set(jnp.where(better, random_plans, slots))
+    unchanged = n + slots.size + jnp.arange(n)
     advantage = values[best] - values[unchanged]
     if config.annealed:
         temperature = hyper.temperature * state.progress.gain
         advantage += temperature * jax.random.logistic(k_keep, (n,))
     kept = jnp.where(advantage > 0.0, best, unchanged)
     return Choice(
-        _pick(plans, unchanged), _pick(plans, kept), _pick(tails, kept), _pick(sensitivity, best)
+        _rows(plans, unchanged), _rows(plans, kept), _rows(tails, kept), _rows(sensitivity, best)
     )
 
 
 def _random_slots(config: EpochConfig) -> np.ndarray:
-    """:return: the rollouts for which random plans are tried too"""
-    count = round(config.n_rollouts * config.random_share) if config.n_candidates else 0
+    """:return: indices of the rollouts that also get random plans"""
+    count = round(config.n_rollouts * _RANDOM_SHARE) if config.n_candidates else 0
     return np.linspace(0, config.n_rollouts, count, endpoint=False).astype(int)
 
 
@@ -274,7 +263,7 @@ def _improve(
     varied: Params,
     key: PRNGKeyArray,
 ) -> tuple[Plan, Float[Array, "plans horizon"]]:
-    """:return: the improved plans, and what an error of each of their controls costs"""
+    """:return: the improved plans, and the cost of an error in each of their controls"""
     discounts = config.discount ** jnp.arange(config.horizon)
     temperature = hyper.temperature * state.progress.gain
 
@@ -290,42 +279,42 @@ def _improve(
         if config.planner == "ilqr":
             plan, gains = ilqr(here, start, first, **options)
             return plan, jnp.sqrt(gains.sensitivity / discounts)
-        improver = gradient_ascent if config.planner == "first_order" else gauss_newton
-        return improver(here, start, first, **options), jnp.ones(config.horizon)
+        plan = METHODS[config.planner](here, start, first, **options)
+        return plan, jnp.ones(config.horizon)
 
     keys = jax.random.split(key, first.value.shape[0]) if config.annealed else None
     return jax.vmap(one, (0, 0, None if keys is None else 0))(first, varied, keys)
 
 
 def _tail(config: EpochConfig, problem: Problem, policy, end: State) -> jax.Array:
-    """Value of a plan's end by what the policy makes of it: errors of V are not exploited."""
+    """Value of a plan's end from a rollout of the policy, which does not exploit errors of V."""
     if not config.lookahead:
         return problem.value_at_end(end)
     return follow(problem, end, policy, config.lookahead).value
 
 
-def _move_on(
-    config: EpochConfig, state: EpochState, hyper: Hyperparams, wandering: Plan, key: PRNGKeyArray
+def _advance_starts(
+    config: EpochConfig, state: EpochState, hyper: Hyperparams, exploring: Plan, key: PRNGKeyArray
 ) -> tuple[State, Float[Array, " rollouts"]]:
-    """The next start states: where the policy went with exploration noise, or a reset."""
+    """:return: the next start states, from the rollouts with exploration noise or resets; ages"""
     n = config.n_rollouts
     k_reset, k_draw = jax.random.split(key)
-    fresh = resets(config.twin, hyper.params, k_draw, n)
+    reset_states = resets(config.twin, hyper.params, k_draw, n)
     if not config.advance:
-        return fresh, jnp.zeros(n)
-    moved = jax.tree.map(lambda leaf: leaf[:, config.advance], wandering.states)
+        return reset_states, jnp.zeros(n)
+    moved = jax.tree.map(lambda leaf: leaf[:, config.advance], exploring.states)
     ages = state.workspace.ages + config.advance
     finite = jnp.isfinite(moved.q).all(1) & jnp.isfinite(moved.v).all(1)
     too_old = ages >= longest_episode(config.twin)
     drawn = jax.random.uniform(k_reset, (n,)) < _reset_rates(hyper.reset_share, n)
-    again = too_old | drawn | ~wandering.alive[:, config.advance] | ~finite
-    return _where(again, fresh, moved), jnp.where(again, 0.0, ages)
+    again = too_old | drawn | ~exploring.alive[:, config.advance] | ~finite
+    return _choose_rows(again, reset_states, moved), jnp.where(again, 0.0, ages)
 
 
 def _reset_rates(share: float, n: int) -> Float[Array, " rollouts"]:
     """
-    How often each rollout is reset: ``share`` on average, distributed from hardly ever to
-    nearly always, so that there are start states soon after a reset and long after one.
+    Reset probability of each rollout: ``share`` on average, from nearly 0 to nearly 1, so that
+    start states are both shortly and long after a reset.
     """
     position = (jnp.arange(n) + 0.5) / n
     return position ** (1.0 / share - 1.0)
@@ -348,23 +337,23 @@ def _mean(values: jax.Array, counted: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(counted, values, 0.0)) / jnp.maximum(jnp.sum(counted), 1)
 
 
-def _joined(one, other):
+def _concatenated(one, other):
     """:return: the rows of both"""
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), one, other)
 
 
-def _pick(tree, index):
+def _rows(tree, index):
     """:return: the rows ``index`` of every leaf"""
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def _where(condition, new, old):
+def _choose_rows(condition, new, old):
     """Choose row by row."""
     rows = lambda leaf: condition.reshape(-1, *[1] * (leaf.ndim - 1))  # noqa: E731
     return jax.tree.map(lambda a, b: jnp.where(rows(a), a, b), new, old)
 
 
 def programs(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> list[Callable[[], Any]]:
-    """:return: the programs of an epoch; running them once, in parallel, compiles them"""
+    """:return: the programs of an epoch, to be compiled in parallel by running each once"""
     used = [plan_ahead, *regressions(config)]
     return [partial(program, config, state, hyper) for program in used]

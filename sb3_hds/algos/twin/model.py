@@ -1,7 +1,7 @@
-"""The twin that an algorithm plans in: which, whether it can, and how observations are scaled."""
+"""The twin that an algorithm plans in: choice, checks, effects, and observations as it has them."""
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -14,19 +14,19 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_hds import effects, twins
 from sb3_hds.algos.base.construct import in_one_line
 from sb3_hds.algos.base.files import from_state_dict, to_state_dict
-from sb3_hds.algos.twin.state import View
+from sb3_hds.algos.twin.policy import View, unclipped
 from sb3_hds.core import Effect, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.errors import EnvironmentMismatchError, NoTwinError, RewardError
 from sb3_hds.planning import Problem, best_of_random
 
-# Rollouts and steps from which the first statistics are made.
+# Rollouts and steps for the first statistics of ``VecNormalize``.
 _N_ROLLOUTS, _N_STEPS = 64, 50
 
 
 def check_twin_observes(space: spaces.Space) -> None:
     """
-    :raises EnvironmentMismatchError: for dictionaries, images and whatever else no twin has
+    :raises EnvironmentMismatchError: for anything but a Box with one axis
     """
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise EnvironmentMismatchError(
@@ -37,7 +37,7 @@ def check_twin_observes(space: spaces.Space) -> None:
 
 def check_reward(twin: Twin) -> None:
     """
-    :raises RewardError: if this twin has no reward that planning could improve
+    :raises RewardError: if the twin has no reward with a gradient and no planning reward
     """
     base = plant_of(twin)
     surrogate = type(base).planning_reward is not Twin.planning_reward
@@ -47,14 +47,15 @@ def check_reward(twin: Twin) -> None:
         )
     if not surrogate and not base.reward_has_gradient:
         raise RewardError(
-            f"The reward of {twin.name} is flat almost everywhere, so its gradient tells nothing. "
-            "Implement `planning_reward`: a smooth surrogate that is best where the reward is best."
+            f"The reward of {twin.name} is flat almost everywhere, so its gradient is zero. "
+            "Implement `planning_reward`: a smooth surrogate with the same maximum."
         )
 
 
 def twin_given(twin: Any) -> Twin | None:
     """
-    :param twin: one, its name, or None
+    :param twin: a twin, its name, or None
+    :return: the twin, or None
     :raises NoTwinError: for a name that is not registered
     :raises TypeError: for anything else
     """
@@ -97,8 +98,8 @@ def twin_from_spec(spec: dict[str, Any]) -> Twin | None:
 
 def missing_effects(twin: Twin, wanted: Sequence[str | dict[str, Any]]) -> list[Effect]:
     """
-    :param wanted: names of effects, each meant at every place that it may have, or specs of effects
-    :return: those that the twin does not have yet
+    :param wanted: names of effects, each for all of its possible locations, or specs of effects
+    :return: the effects that the twin does not have yet
     :raises EffectError: for a name that is not in the catalogue
     """
     found: list[Effect] = []
@@ -113,17 +114,9 @@ def missing_effects(twin: Twin, wanted: Sequence[str | dict[str, Any]]) -> list[
     return [effect for effect in found if not _has(twin, effect)]
 
 
-def check_known(names: Iterable[str]) -> None:
-    """
-    :raises EffectError: for a name that is not in the catalogue
-    """
-    for name in names:
-        effects.effect_named(name, effects.KNOWN)
-
-
 def nulls_of(attached: Sequence[Effect]) -> dict[str, float]:
     """
-    :param attached: effects that name their place
+    :param attached: effects with the names of their locations
     :return: nominal values of their parameters, by full name
     """
     return {
@@ -167,10 +160,10 @@ class Tensors:
 def view_of(normalise: VecNormalize | None, n_obs: int) -> View:
     """
     :param normalise: the environment's normalisation, if it has one
-    :return: what it does to an observation of the twin
+    :return: its effect on observations of the twin
     """
     if normalise is None or not normalise.norm_obs:
-        return View(jnp.zeros(n_obs), jnp.ones(n_obs), jnp.full((), jnp.inf, jnp.float32))
+        return View(jnp.zeros(n_obs), jnp.ones(n_obs), unclipped())
     statistics: Any = normalise.obs_rms
     scale = np.sqrt(statistics.var + normalise.epsilon)
     return View(
@@ -182,10 +175,10 @@ def view_of(normalise: VecNormalize | None, n_obs: int) -> View:
 
 def prepare_statistics(normalise: VecNormalize | None, twin: Twin, key: jax.Array) -> None:
     """
-    Give a fresh ``VecNormalize`` the statistics of episodes in the twin. Otherwise a policy that is
-    trained before the first real step would see other numbers afterwards.
+    Give a new ``VecNormalize`` the statistics of episodes in the twin. Otherwise, its scales would
+    change after the pretraining of the policy.
 
-    Statistics that are frozen, or already rest on more observations, are left alone.
+    Frozen statistics, and those of more observations, do not change.
 
     :param normalise: changed in place
     """

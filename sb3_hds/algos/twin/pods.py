@@ -10,14 +10,12 @@ class PODS(TwinAlgorithm):
     Policy optimisation through differentiable simulation.
 
     In each epoch, roll the policy out in the twin from many start states, improve each *sequence of
-    actions* by its first- or second-order model with a line search in the simulator, and regress
-    the policy on the states of the improved trajectories. No plan is ever worse than what it
-    started from.
+    actions* by first- or second-order steps with a line search in the simulator, and regress the
+    policy on the states of the improved trajectories. No plan is ever worse than its start.
 
-    Where this differs from the paper by default, because whole episodes planned from scratch get
-    stuck on swing-ups: short horizons with a learned terminal value, random warm starts, start
-    states that go on from epoch to epoch, weighted regression. Every one of these is an argument,
-    so that the paper's setting can be reached::
+    The defaults differ from the paper, because full episodes planned from scratch get stuck on
+    swing-ups: short horizons with a learned terminal value, random warm starts, start states that
+    continue from epoch to epoch, weighted regression. Arguments restore the paper's settings::
 
         PODS(env, planner="gauss_newton", horizon=100, n_iterations=1, n_random_plans=0,
              lookahead=0, terminal_value=False, reset_share=1.0, plan_memory=1, loss="squared",

@@ -1,4 +1,4 @@
-"""Planning epochs before the first real step, and what callbacks and loggers make of them."""
+"""Planning epochs before the first real step, and how callbacks and loggers see them."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -15,26 +15,26 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.logger import Logger
 
-# Log lines written during pretraining.
+# Number of log lines during the pretraining.
 _N_LOGS = 10
-# Between two calls of callbacks while programs compile. [s]
+# Time between two calls of callbacks while programs compile [s].
 _PATIENCE = 0.5
 
 
 class Pretraining(CallbackList):
     """
-    Runs the planning epochs that are due when training starts, so that everything SB3 sets up for
-    ``learn`` (logger, other callbacks, environment) is there. Interrupted, it leaves a model that
-    goes on where it stopped.
+    Run the planning epochs that are due when training starts, after SB3 has set up everything for
+    ``learn`` (logger, other callbacks, environment). An interrupted model continues where it
+    stopped.
 
-    The other callbacks are called after each epoch, and twice a second while programs compile, but
-    for those of SB3 that act every n-th call, as if a step of the environment had been made:
-    ``num_timesteps`` stays, ``locals["pretraining"]`` is True, there are no rewards, and no episode
-    ended. What they count as calls meanwhile is forgotten before the first real step, so that
-    ``eval_freq`` and ``save_freq`` go on counting steps alone.
+    The other callbacks are called after each epoch as if after a step of the environment, with an
+    unchanged ``num_timesteps``, ``locals["pretraining"]`` True, no rewards and no ended episodes;
+    also twice a second while programs compile, except those of SB3 that act every n-th call. Their
+    counts of calls are restored before the first real step, so that ``eval_freq`` and ``save_freq``
+    count steps only.
 
-    :param callbacks: the others
-    :param progress_bar: whether to show one
+    :param callbacks: the other callbacks
+    :param progress_bar: whether to show a progress bar
     """
 
     def __init__(self, callbacks: list[BaseCallback], progress_bar: bool) -> None:
@@ -44,7 +44,7 @@ class Pretraining(CallbackList):
     def _on_training_start(self) -> None:
         super()._on_training_start()
         model: Any = self.model
-        self.update_locals(_no_step(model))
+        self.update_locals(_step_placeholder(model))
         model.poll = self._poll
         try:
             with _own_series(model), _counts_restored(self.callbacks):
@@ -52,14 +52,16 @@ class Pretraining(CallbackList):
         except _StoppedError:
             model.stopped = True
         finally:
-            model.poll = nothing
+            model.poll = no_poll
             self.update_locals({"pretraining": False})
 
     def _run(self, model: Any) -> None:
         model.before_planning()
         due = model.pretraining_due
         every = max(1, due // _N_LOGS)
-        bars = [each for each in _each(self.callbacks) if isinstance(each, ProgressBarCallback)]
+        bars = [
+            each for each in _flattened(self.callbacks) if isinstance(each, ProgressBarCallback)
+        ]
         for i in self._shown(range(1, due + 1)):
             model.pretrain_epoch()
             for bar in bars:
@@ -74,12 +76,12 @@ class Pretraining(CallbackList):
             bar.pbar.set_description("")
 
     def _poll(self) -> None:
-        """While programs compile: there is no epoch yet that anybody could count."""
+        """Call callbacks while programs compile; calls are not counted, as there was no epoch."""
         with _counts_restored(self.callbacks):
             _call(self.callbacks, ProgressBarCallback, EventCallback, CheckpointCallback)
 
     def _on_step(self) -> bool:
-        """SB3 stores a step after the callbacks have seen it, checkpoints among them."""
+        """Keep the step for callbacks that save the model: SB3 stores it after callbacks."""
         model: Any = self.model
         names = ("buffer_actions", "new_obs", "rewards", "dones", "infos")
         model.unstored_step = {name: self.locals[name] for name in names}
@@ -99,11 +101,11 @@ class _StoppedError(Exception):
 
 class OwnSeries(Logger):
     """
-    Logs what comes before the first real step under names of its own, ``pretrain/...``, with the
-    number of planning epochs as the step: on the axis of timesteps, all of it would be at 0.
+    Log the pretraining under separate names, ``pretrain/...``, over the number of planning epochs:
+    its timesteps are all 0.
 
-    :param logger: that writes it
-    :param n_epochs: so far
+    :param logger: that writes the lines
+    :param n_epochs: returns the number of epochs so far
     """
 
     def __init__(self, logger: Logger, n_epochs: Callable[[], int]) -> None:
@@ -123,15 +125,14 @@ class OwnSeries(Logger):
             kept.clear()
 
 
-def nothing() -> None:
-    """Does nothing: there is no callback to call while programs compile."""
+def no_poll() -> None:
+    """Do no_poll: the value of ``poll`` outside the pretraining."""
 
 
-def beside(work: Callable[[], Any]) -> Future[Any]:
+def run_in_thread(work: Callable[[], Any]) -> Future[Any]:
     """
-    :param work: changes nothing
-    :return: what it will return; it is done in a thread of its own, which Python waits for before
-        it exits
+    :param work: a function without side effects
+    :return: its future result; it runs in another thread, for which Python waits before it exits
     """
     pool = ThreadPoolExecutor(1)
     try:
@@ -140,16 +141,16 @@ def beside(work: Callable[[], Any]) -> Future[Any]:
         pool.shutdown(wait=False)
 
 
-def meanwhile(works: Sequence[Callable[[], Any]], poll: Callable[[], None]) -> list[Any]:
+def run_in_threads(works: Sequence[Callable[[], Any]], poll: Callable[[], None]) -> list[Any]:
     """
-    Work in other threads, so that this one can be interrupted.
+    Run functions in other threads, so that this one can be interrupted.
 
-    An interrupt ends the waiting only: the work goes on, its result is lost, and Python waits for
-    it before it exits.
+    An interrupt ends the waiting only: the functions continue, their results are lost, and Python
+    waits for them before it exits.
 
-    :param works: change nothing
-    :param poll: is called now and then; what it raises ends the waiting
-    :return: what they returned
+    :param works: functions without side effects
+    :param poll: is called twice a second; an error that it raises ends the waiting
+    :return: the results of the functions
     """
     pool = ThreadPoolExecutor(len(works))
     try:
@@ -161,8 +162,8 @@ def meanwhile(works: Sequence[Callable[[], Any]], poll: Callable[[], None]) -> l
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _no_step(model: Any) -> dict[str, Any]:
-    """:return: what callbacks find in ``locals`` after a step, of one that was not made"""
+def _step_placeholder(model: Any) -> dict[str, Any]:
+    """:return: ``locals`` for callbacks in place of those of a step"""
     space: Any = model.action_space
     n_envs = model.n_envs
     no_action = np.zeros((n_envs, *space.shape), space.dtype)
@@ -185,29 +186,29 @@ def _no_step(model: Any) -> dict[str, Any]:
     }
 
 
-def _each(callbacks: Iterable[BaseCallback]) -> Iterator[BaseCallback]:
-    """:return: those in lists, too"""
+def _flattened(callbacks: Iterable[BaseCallback]) -> Iterator[BaseCallback]:
+    """:return: all callbacks, also those in nested lists"""
     for callback in callbacks:
         if type(callback) is CallbackList:
-            yield from _each(callback.callbacks)
+            yield from _flattened(callback.callbacks)
         else:
             yield callback
 
 
 def _call(callbacks: Iterable[BaseCallback], *but: type[BaseCallback]) -> None:
     """
-    :param but: those that act every n-th step of the environment, or count steps
-    :raises _StoppedError: if one of them wants training to stop
+    :param but: classes of callbacks that are not called
+    :raises _StoppedError: if a callback ends the training
     """
-    called = [each for each in _each(callbacks) if not isinstance(each, but)]
-    # All of them, as in SB3, also where the first one says no.
+    called = [each for each in _flattened(callbacks) if not isinstance(each, but)]
+    # Call all of them, as in SB3, also after one has returned False.
     if not all([callback.on_step() for callback in called]):
         raise _StoppedError
 
 
 @contextmanager
 def _counts_restored(callbacks: Iterable[BaseCallback]) -> Iterator[None]:
-    before = [(callback, callback.n_calls) for callback in _each(callbacks)]
+    before = [(callback, callback.n_calls) for callback in _flattened(callbacks)]
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""Learning from plans: regress policy and value on them, and choose the policy that acts."""
+"""Regression of policy and value on plans, and the choice of the policy that acts."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,15 +11,20 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from sb3_hds.algos.twin.networks import output, squash, value_of, with_input_scales
+from sb3_hds.algos.twin.policy import (
+    View,
+    clipped_adam,
+    output,
+    squash,
+    value_of,
+    with_input_scales,
+)
 from sb3_hds.algos.twin.state import (
     EpochConfig,
     EpochState,
     Hyperparams,
     Samples,
-    View,
-    clipped_adam,
-    for_each,
+    grouped_vmap,
     longest_episode,
     resets,
 )
@@ -27,16 +32,15 @@ from sb3_hds.core import Twin
 from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION
 from sb3_hds.planning import Plan, Problem, follow
 
-# Where the absolute error of the regression turns into a squared one, in units of the control
-# scale.
+# Error below which the absolute loss becomes quadratic, in units of the control scale.
 _SMOOTH_ERROR = 0.1
-# Epochs after which a new one counts one half in the scales that follow the plans.
+# Numerator of the rate at which scales follow the plans: after this many epochs, it is 1/2.
 _FORGETTING = 3.0
-# Below this, an input does not move and its scale is left alone; controls are at least this large.
-_LEAST_SPREAD, _LEAST_EFFORT = 1e-6, 1e-3
-# No sample counts more than this many times the mean.
+# Inputs with a smaller standard deviation keep their scale; smallest control scale.
+_LEAST_STD, _LEAST_CONTROL = 1e-6, 1e-3
+# Largest weight of a sample, in units of the mean weight.
 _LARGEST_WEIGHT = 20.0
-# Simulated steps of a policy in a comparison, and the numbers of episodes between which they make.
+# Simulated steps of each policy in a comparison, and the limits of the number of episodes.
 _STEPS_COMPARED = 64_000
 _FEWEST, _MOST = 32, 256
 
@@ -50,19 +54,18 @@ def samples_of(
     sensitivity: Float[Array, "rollouts horizon"],
 ) -> tuple[Samples, Bool[Array, " rollouts"]]:
     r"""
-    At every state of the *improved* trajectories: the control to copy, the objective from there on
+    Samples at every state of the *improved* trajectories: the control, the objective from there on
 
     .. math:: Y_t = r_t + \gamma Y_{t+1}
 
-    and a weight that grows with what the plan gained over the policy and with what an error costs
-    there.
+    and a weight that grows with the plan's gain over the policy and with the cost of an error.
 
     :param kept: plans, leaves of shape ``(n_rollouts, ...)``
     :param tails: value of each plan's last state
     :param gain: of each plan over the policy's own
-    :param sensitivity: cost of an error of each control
+    :param sensitivity: cost of an error in each control
     :return: samples, leaves of shape ``(horizon * n_rollouts, ...)``, and which plans were finite;
-        the others weigh nothing
+        the others have weight zero
     """
     before = jax.tree.map(lambda leaf: leaf[:, :-1], kept.states)
     obs = jax.vmap(jax.vmap(lambda state: hyper.view(problem.observe(state))))(before)
@@ -88,7 +91,7 @@ def samples_of(
 
 
 def remember(config: EpochConfig, state: EpochState, samples: Samples) -> EpochState:
-    """Write an epoch's samples over the oldest row."""
+    """Replace the oldest row of samples by those of this epoch."""
     work = state.workspace
     row = work.n_filled % config.plan_memory
     write = lambda rows, new: jax.lax.dynamic_update_index_in_dim(rows, new, row, 0)  # noqa: E731
@@ -98,51 +101,47 @@ def remember(config: EpochConfig, state: EpochState, samples: Samples) -> EpochS
 
 def rescale(state: EpochState, samples: Samples) -> EpochState:
     """
-    Let the scales of inputs and controls follow the plans: near a balance both are far smaller than
-    in the random rollouts from which they were first taken. Old epochs are forgotten at a rate of
-    3/n. The networks' first layers change with their inputs, so that what they compute does not.
+    Let the scales of inputs and controls follow the plans, at a rate of 3 / (n + 3) after n epochs:
+    near a balance, both are far smaller than in the first, random rollouts. The networks' first
+    layers change with the scales of their inputs, so that their outputs stay the same.
     """
     nets, progress = state.networks, state.progress
     counted = samples.alive[:, None]
     rate = _FORGETTING / (progress.n_epochs + _FORGETTING) * jnp.any(counted > 0.0)
     total = jnp.maximum(jnp.sum(counted), 1.0)
     mean = jnp.sum(counted * samples.obs, 0) / total
-    spread = jnp.sqrt(jnp.sum(counted * (samples.obs - mean) ** 2, 0) / total)
-    sizes = jnp.log(jnp.abs(samples.control) + _LEAST_EFFORT)
-    effort = jnp.exp(jnp.sum(counted * sizes, 0) / total)
-    follow = lambda old, new: old + rate * (new - old)  # noqa: E731
-    spread = jnp.where(spread > _LEAST_SPREAD, spread, nets.inside.scale)
+    std = jnp.sqrt(jnp.sum(counted * (samples.obs - mean) ** 2, 0) / total)
+    sizes = jnp.log(jnp.abs(samples.control) + _LEAST_CONTROL)
+    control_scale = jnp.exp(jnp.sum(counted * sizes, 0) / total)
+    update = lambda old, new: old + rate * (new - old)  # noqa: E731
+    std = jnp.where(std > _LEAST_STD, std, nets.inside.scale)
     inside = nets.inside._replace(
-        mean=follow(nets.inside.mean, mean), scale=follow(nets.inside.scale, spread)
+        mean=update(nets.inside.mean, mean), scale=update(nets.inside.scale, std)
     )
-    effort = jnp.clip(follow(progress.control_scale, effort), _LEAST_EFFORT, 1.0)
+    control_scale = jnp.clip(update(progress.control_scale, control_scale), _LEAST_CONTROL, 1.0)
     actor, average, value = (
         with_input_scales(weights, nets.inside, inside)
         for weights in (nets.actor, nets.average, nets.value)
     )
     nets = nets._replace(actor=actor, average=average, value=value, inside=inside)
-    return state._replace(
-        networks=nets,
-        progress=progress._replace(control_scale=effort),
-    )
+    return state._replace(networks=nets, progress=progress._replace(control_scale=control_scale))
 
 
-def regress_policy(
-    config: EpochConfig, state: EpochState, hyper: Hyperparams, key: PRNGKeyArray
-) -> tuple[Mapping[str, Any], Any, Float[Array, " 2"]]:
+@partial(jax.jit, static_argnums=0)
+def learn_policy(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
     r"""
-    Adam on minibatches of the remembered samples.
+    Regress the policy on the remembered samples: Adam on minibatches.
 
-    The policy learns from the first steps of each plan only: what a plan does towards its end
-    depends on the value found there.
+    The policy learns from the first steps of each plan only: the end of a plan depends on the
+    learned value.
 
-    Its loss is :math:`w\,\sqrt{e^2 + 0.1^2}` with the error :math:`e` in units of the control
-    scale: a squared error averages between turning left and turning right, and blurs the moments
-    of switching. The paper's :math:`w\,e^2/2`, in units of the control, is a setting.
+    The loss is :math:`w\,\sqrt{e^2 + 0.1^2}` with the error :math:`e` in units of the control
+    scale: a squared error averages between turning left and turning right, and blurs switching
+    times. The paper's :math:`w\,e^2/2`, in units of the control, is an option.
 
-    :param key: that of :func:`regress_value`, too: both draw from it, and not the same
-    :return: the policy's parameters and the state of Adam; the mean loss, and the mean norm of the
-        gradient before it is clipped
+    :return: the policy's parameters, their moving average and the state of Adam; the mean loss, and
+        the mean norm of the gradient before it is clipped; the number of epochs and the random key
+        after this one
     """
     inside, unit = state.networks.inside, state.progress.control_scale
 
@@ -152,23 +151,31 @@ def regress_policy(
             return jnp.mean(batch.weight[:, None] * 0.5 * error**2)
         return jnp.mean(batch.weight[:, None] * jnp.sqrt((error / unit) ** 2 + _SMOOTH_ERROR**2))
 
+    nets, progress = state.networks, state.progress
+    key, k_regress = _next_keys(state)
+    # The value draws from the same key, but other numbers.
+    keys = lambda i: jax.random.split(jax.random.fold_in(k_regress, i))[0]  # noqa: E731
     n_early = config.n_learned * config.n_rollouts
-    begin = state.networks.actor, state.progress.actor_optimizer
-    keys = lambda i: jax.random.split(jax.random.fold_in(key, i))[0]  # noqa: E731
-    return _descent(config, state, hyper, loss, n_early, keys, *begin)
+    begin = nets.actor, progress.actor_optimizer
+    actor, optimizer, (mean_loss, norm) = _descent(
+        config, state, hyper, loss, n_early, keys, *begin
+    )
+    decay = jnp.where(progress.n_epochs > 0, hyper.averaging, 0.0)
+    average = jax.tree.map(lambda a, new: decay * a + (1.0 - decay) * new, nets.average, actor)
+    after = progress.n_epochs + 1, jax.random.key_data(key)
+    return actor, average, optimizer, mean_loss, norm, *after
 
 
-def regress_value(
-    config: EpochConfig, state: EpochState, hyper: Hyperparams, key: PRNGKeyArray
-) -> tuple[Mapping[str, Any], Any, Float[Array, " 2"]]:
+@partial(jax.jit, static_argnums=0)
+def learn_value(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
     """
-    As :func:`regress_policy` does. The value, which is asked for at the ends of plans, learns from
-    all of their steps.
+    Regress the value on the remembered samples. It is evaluated at the ends of plans, so it learns
+    from all of their steps.
 
-    :return: the value's parameters and the state of Adam; the mean loss, and the mean norm of the
-        gradient before it is clipped
+    :return: the value's parameters, the state of Adam, and the mean loss
     """
     inside = state.networks.inside
+    _, key = _next_keys(state)
 
     def loss(value, batch: Samples) -> jax.Array:
         found = value_of(output(config.value, value, inside(batch.obs)))
@@ -178,7 +185,8 @@ def regress_value(
     n_columns = config.horizon * config.n_rollouts
     begin = state.networks.value, state.progress.value_optimizer
     keys = lambda i: jax.random.split(jax.random.fold_in(key, i))[1]  # noqa: E731
-    return _descent(config, state, hyper, loss, n_columns, keys, *begin)
+    value, optimizer, losses = _descent(config, state, hyper, loss, n_columns, keys, *begin)
+    return value, optimizer, losses[0]
 
 
 def _descent(
@@ -191,7 +199,7 @@ def _descent(
     weights: Mapping[str, Any],
     optimizer: Any,
 ) -> tuple[Mapping[str, Any], Any, Float[Array, " 2"]]:
-    """Of each remembered epoch, the first ``n`` samples are drawn from."""
+    """Adam on batches that are drawn from the first ``n`` samples of each remembered epoch."""
     adam, work = clipped_adam(config.max_grad_norm), state.workspace
     filled = jnp.minimum(work.n_filled, config.plan_memory)
 
@@ -220,7 +228,7 @@ def _to_go(problem: Problem, plan: Plan, tail: jax.Array) -> Float[Array, " hori
 
 
 def _weight(quantity: jax.Array, share: float | jax.Array) -> jax.Array:
-    """A weight with mean near one, a share of it in proportion to ``quantity``."""
+    """:return: weights with a mean near one, a share of which is proportional to ``quantity``"""
     finite = jnp.where(jnp.isfinite(quantity), quantity, 0.0)
     relative = finite / (jnp.mean(finite) + 1e-6)
     return 1.0 - share + share * jnp.minimum(relative, _LARGEST_WEIGHT)
@@ -230,15 +238,15 @@ def learn_from_plans(
     config: EpochConfig, state: EpochState, hyper: Hyperparams
 ) -> tuple[EpochState, tuple[Any, Any, Any]]:
     """
-    The second half of an epoch: the regressions. That of the policy and that of the value know
-    nothing of each other, and with small networks one of them keeps little more than one core busy.
+    The second half of an epoch: the regressions of policy and value. They are independent and run
+    in parallel, since with small networks, each uses little more than one core.
 
     :return: the state; the mean losses of policy and value, and the mean norm of the policy's
         gradient before it is clipped
     """
     learning = [partial(each, config, state, hyper) for each in regressions(config)]
-    of_policy, *of_value = side_by_side(learning)
-    (actor, optimizer, (loss, norm)), average, n_epochs, key = of_policy
+    of_policy, *of_value = run_in_parallel(learning)
+    actor, average, optimizer, loss, norm, n_epochs, key = of_policy
     nets = state.networks._replace(actor=actor, average=average)
     progress = state.progress._replace(actor_optimizer=optimizer, n_epochs=n_epochs, key=key)
     value_loss: Any = 0.0
@@ -254,32 +262,10 @@ def regressions(config: EpochConfig) -> list[Callable[..., Any]]:
     return [learn_policy, *([learn_value] if config.terminal_value else [])]
 
 
-@partial(jax.jit, static_argnums=0)
-def learn_policy(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
+def run_in_parallel(works: Sequence[Callable[[], Any]]) -> list[Any]:
     """
-    :return: see :func:`~sb3_hds.algos.twin.regression.regress_policy`; the average of policies, the
-        number of epochs and the random key after this one
-    """
-    nets, progress = state.networks, state.progress
-    key, k_regress = _next_keys(state)
-    actor, optimizer, (loss, norm) = regress_policy(config, state, hyper, k_regress)
-    decay = jnp.where(progress.n_epochs > 0, hyper.averaging, 0.0)
-    average = jax.tree.map(lambda a, new: decay * a + (1.0 - decay) * new, nets.average, actor)
-    learned = (actor, optimizer, (loss, norm))
-    return learned, average, progress.n_epochs + 1, jax.random.key_data(key)
-
-
-@partial(jax.jit, static_argnums=0)
-def learn_value(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> tuple[Any, ...]:
-    """:return: the value's parameters, the state of Adam, and the mean loss"""
-    value, optimizer, losses = regress_value(config, state, hyper, _next_keys(state)[1])
-    return value, optimizer, losses[0]
-
-
-def side_by_side(works: Sequence[Callable[[], Any]]) -> list[Any]:
-    """
-    :param works: change nothing; the first is done in this thread
-    :return: what they returned
+    :param works: functions without side effects; the first one runs in this thread
+    :return: their results
     """
     first, *others = works
     if not others:
@@ -290,7 +276,7 @@ def side_by_side(works: Sequence[Callable[[], Any]]) -> list[Any]:
 
 
 def _next_keys(state: EpochState) -> jax.Array:
-    """:return: the random key after this half of the epoch, and the one for it"""
+    """:return: the random key after this half of the epoch, and the one to use in it"""
     return jax.random.split(jax.random.wrap_key_data(state.progress.key, impl=GENERATOR))
 
 
@@ -298,10 +284,10 @@ def choose_policy(
     config: EpochConfig, state: EpochState, hyper: Hyperparams, every: int, due: bool
 ) -> tuple[EpochState, Float[np.ndarray, " 2"] | None]:
     """
-    After an epoch: the average acts, until it was first compared; then the better one does.
+    After an epoch: the averaged policy acts until the first comparison, then the better one does.
 
-    :param every: epochs from one comparison to the next; 0: never
-    :param due: compare after this epoch in any case, unless never
+    :param every: epochs between two comparisons; 0: no comparisons
+    :param due: compare after this epoch in any case, unless ``every`` is 0
     :return: the state, and the returns of a comparison, see :func:`keep_better`
     """
     n_epochs = int(state.progress.n_epochs)
@@ -320,7 +306,7 @@ def is_compared(n_epochs: int, every: int, due: bool) -> bool:
 
 
 def comparison(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Callable[[], Any]:
-    """:return: the program of a comparison; running it once compiles it"""
+    """:return: the program of a comparison, to be compiled by running it once"""
     nets = state.networks
     given = (state.progress.key, nets.average, nets.inside)
     return partial(mean_return, config, hyper, *given)
@@ -335,16 +321,16 @@ def keep_better(
     config: EpochConfig, state: EpochState, hyper: Hyperparams
 ) -> tuple[EpochState, Float[np.ndarray, " 2"]]:
     """
-    Let the average and the policy that acts go through whole episodes of the twin, from the same
-    start states, and let the better one act: where a system falls over, a single epoch may spoil
-    what took many to learn.
+    Compare the averaged policy with the one that acts on full episodes of the twin from the same
+    start states, and let the better one act: for a system that can fall, a single epoch may spoil
+    the policy.
 
     :return: the state, and the mean return of both, in planning rewards
     """
     nets, progress = state.networks, state.progress
     pairs = ((nets.average, nets.inside), (nets.acting, nets.acting_inside))
     going = [partial(mean_return, config, hyper, progress.key, *pair) for pair in pairs]
-    (of_average, key), (of_acting, _) = side_by_side(going)
+    (of_average, key), (of_acting, _) = run_in_parallel(going)
     returns = np.array([float(of_average), float(of_acting)], np.float32)
     acting, inside = pairs[0] if returns[0] > returns[1] else pairs[1]
     return state._replace(
@@ -362,20 +348,20 @@ def mean_return(
     inside: View,
 ) -> tuple[jax.Array, jax.Array]:
     """
-    :param key: random, as integers
-    :return: mean return of a policy over whole episodes of the twin, in planning rewards; the key
-        after that
+    :param key: random key, as integers
+    :return: mean return of a policy over full episodes of the twin, in planning rewards; the next
+        random key
     """
     after, k_starts = jax.random.split(jax.random.wrap_key_data(key, impl=GENERATOR))
     twin = config.twin
     problem = Problem(twin, hyper.params)
     starts = resets(twin, hyper.params, k_starts, _n_starts(twin))
     length = longest_episode(twin)
-    spread = np.linspace(0, config.n_rollouts - 1, _n_starts(twin)).round().astype(int)
-    varied = jax.tree.map(lambda leaf: leaf[spread], hyper.varied)
+    rollouts = np.linspace(0, config.n_rollouts - 1, _n_starts(twin)).round().astype(int)
+    varied = jax.tree.map(lambda leaf: leaf[rollouts], hyper.varied)
     policy = lambda obs: output(config.actor, actor, inside(hyper.view(obs)))  # noqa: E731
     value = lambda s, own: follow(problem.with_params(own), s, policy, length).value  # noqa: E731
-    return jnp.mean(for_each(value, starts, varied)), jax.random.key_data(after)
+    return jnp.mean(grouped_vmap(value, starts, varied)), jax.random.key_data(after)
 
 
 def _n_starts(twin: Twin) -> int:

@@ -1,35 +1,43 @@
-"""What the algorithms that learn through a twin carry from one planning epoch to the next."""
+"""State, configuration and hyperparameters of a planning epoch."""
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
-from sb3_hds.algos.twin.networks import Actor, Value, output, value_of
+from sb3_hds.algos.twin.policy import (
+    Actor,
+    Networks,
+    Progress,
+    Value,
+    View,
+    output,
+    unclipped,
+    value_of,
+)
 from sb3_hds.core import Obs, Params, State, Twin
-from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION, QUICKEST_COMPILATION
+from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION
 from sb3_hds.planning import Plan, Problem, best_of_random
 
-# The typical shortfall of the first rollouts becomes this many units of the objective.
+# Typical shortfall of the first rollouts after scaling, in units of the objective.
 _TYPICAL_SHORTFALL = 12.0
-# Without discounting, or nearly so, a value counts rewards of at most this many steps.
+# Limit of the effective horizon 1 / (1 - discount) in the scale of rewards [steps].
 _LONGEST = 1000.0
-# Rows that are vectorised together, see `for_each`.
+# Rows that are vectorised together, see `grouped_vmap`.
 _GROUP = 16
-# Episode length where a twin declares none.
+# Episode length of twins that declare none [steps].
 _LONG_EPISODE = 1000
 
 
 @dataclasses.dataclass(frozen=True)
 class EpochConfig:
     """
-    What makes two epochs different programs: a change compiles again. The fields are documented as
+    Static configuration of an epoch: a change recompiles its programs. The fields are documented as
     arguments of ``PODS`` and ``HDS``.
     """
 
@@ -44,7 +52,6 @@ class EpochConfig:
     n_iterations: int
     n_step_sizes: int
     n_candidates: int
-    random_share: float
     discount: float
     terminal_value: bool
     shift_ends: bool
@@ -57,38 +64,21 @@ class EpochConfig:
     adapt_scales: bool
 
 
-class View(NamedTuple):
-    """
-    An affine map with clipping, as ``VecNormalize`` applies to observations.
-
-    :param mean: shape ``(n_obs,)``
-    :param scale: shape ``(n_obs,)``
-    :param clip: largest absolute value that comes out
-    """
-
-    mean: Float[Array, " obs"]
-    scale: Float[Array, " obs"]
-    clip: Any
-
-    def __call__(self, obs: Obs) -> Obs:
-        return jnp.clip((obs - self.mean) / self.scale, -self.clip, self.clip)
-
-
 class Hyperparams(NamedTuple):
     """
-    What may change from epoch to epoch without compiling again.
+    What may change between two epochs without recompiling.
 
     :param params: the twin's parameters
-    :param varied: those of them that differ between rollouts, each of shape ``(n_rollouts,)``
+    :param varied: parameters that differ between rollouts, each of shape ``(n_rollouts,)``
     :param learning_rate: of policy and value
     :param noise: standard deviation of the exploration noise, in units of the control scale
     :param temperature: of the annealed acceptance, in units of the mean gain of the last epoch
     :param reset_share: share of start states drawn from the reset distribution in each epoch
-    :param gain_weight: 0..1, how much a sample counts by what its plan gained
-    :param sensitivity_weight: 0..1, how much a sample counts by what an error of it costs
-    :param averaging: decay of the average of policies, per epoch
+    :param gain_weight: 0..1, share of a sample's weight that is proportional to its plan's gain
+    :param sensitivity_weight: 0..1, share that is proportional to the cost of an error in it
+    :param averaging: decay of the moving average of policies, per epoch
     :param gradient_steps: regression steps
-    :param view: what the environment's own normalisation does to an observation
+    :param view: the environment's own normalisation of observations
     """
 
     params: Params
@@ -104,61 +94,16 @@ class Hyperparams(NamedTuple):
     view: View
 
 
-class Networks(NamedTuple):
-    """
-    What is learned, and saved with a model.
-
-    :param actor: parameters of the policy that is trained
-    :param average: moving average of ``actor``
-    :param value: parameters of the value network
-    :param inside: the networks' own normalisation of their input
-    :param acting: the policy that acts: the best of the averages that were compared
-    :param acting_inside: the normalisation that belongs to it
-    """
-
-    actor: Mapping[str, Any]
-    average: Mapping[str, Any]
-    value: Mapping[str, Any]
-    inside: View
-    acting: Mapping[str, Any]
-    acting_inside: View
-
-
-class Progress(NamedTuple):
-    """
-    What training needs to go on after a break, and is saved with a model.
-
-    :param actor_optimizer: state of Adam
-    :param value_optimizer: state of Adam
-    :param reward_scale: scale of the objective
-    :param reward_offset: reward that counts as zero
-    :param control_scale: geometric mean of the size of the plans' controls, shape ``(n_act,)``
-    :param gain: mean gain of the last epoch's plans, in units of the objective
-    :param n_epochs: epochs done
-    :param key: for random numbers, as integers
-    """
-
-    actor_optimizer: Any
-    value_optimizer: Any
-    reward_scale: jax.Array
-    reward_offset: jax.Array
-    control_scale: jax.Array
-    gain: jax.Array
-    n_epochs: jax.Array
-    key: jax.Array
-
-
 class Samples(NamedTuple):
     """
-    States of plans that were kept, with what is to be learned there. Leaves have shape
-    ``(plan_memory, horizon * n_rollouts, ...)``, first steps first: one row for each of the last
-    epochs.
+    Regression samples at the states of kept plans. Leaves have shape ``(plan_memory, horizon *
+    n_rollouts, ...)``: a row for each of the last epochs, with the first steps first.
 
-    :param obs: as the state sees them
-    :param control: scaled to [-1, 1]
-    :param value: objective from here on
-    :param weight: in the policy's loss; zero where there is nothing to learn
-    :param alive: in the value's loss, 0 or 1
+    :param obs: after the environment's own normalisation
+    :param control: target of the policy, in [-1, 1]
+    :param value: target of the value: objective from this state on
+    :param weight: in the policy's loss; zero after the end of an episode
+    :param alive: weight in the value's loss, 0 or 1
     """
 
     obs: jax.Array
@@ -170,12 +115,12 @@ class Samples(NamedTuple):
 
 class Workspace(NamedTuple):
     """
-    What is rebuilt after loading.
+    State of the training that is not saved, but rebuilt after loading.
 
     :param starts: start states of the next epoch
-    :param ages: how many steps each of them is from a reset
+    :param ages: steps of each start state since its reset
     :param samples: of the last epochs
-    :param n_filled: rows of ``samples`` written so far
+    :param n_filled: number of rows of ``samples`` written so far
     """
 
     starts: State
@@ -186,8 +131,10 @@ class Workspace(NamedTuple):
 
 class Scales(NamedTuple):
     """
-    :param inside: of the networks' input
-    :param reward_scale: of the objective
+    Scales of a task, from random rollouts.
+
+    :param inside: normalisation of the networks' input
+    :param reward_scale: factor from rewards to the objective
     :param reward_offset: reward that counts as zero
     """
 
@@ -204,39 +151,15 @@ class EpochState(NamedTuple):
     workspace: Workspace
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3), compiler_options=QUICKEST_COMPILATION)
-def fresh_networks(
-    actor: Actor, value: Value, n_obs: int, max_grad_norm: float, key: PRNGKeyArray
-) -> tuple[Networks, Progress]:
-    """:return: networks and training state before the first epoch, with scales of one"""
-    k_actor, k_value, k_next = jax.random.split(key, 3)
-    obs = jnp.zeros(n_obs)
-    weights, value_weights = actor.init(k_actor, obs), value.init(k_value, obs)
-    inside = View(jnp.zeros(n_obs), jnp.ones(n_obs), _unclipped())
-    adam = clipped_adam(max_grad_norm)
-    zero = jnp.zeros(())
-    progress = Progress(
-        adam.init(weights),
-        adam.init(value_weights),
-        jnp.ones(()),
-        zero,
-        jnp.ones(actor.n_act),
-        zero,
-        jnp.zeros((), jnp.int32),
-        jax.random.key_data(k_next),
-    )
-    return Networks(weights, weights, value_weights, inside, weights, inside), progress
-
-
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
 def init_workspace(
     config: EpochConfig, params: Params, view: View, progress: Progress
 ) -> tuple[Workspace, Scales, Progress]:
     """
-    Start states from the twin's reset, no samples, and the scales of observations and rewards, read
-    off random rollouts: nothing needs to be set by hand for a new task.
+    Draw start states, without samples, and take the scales of observations and rewards from random
+    rollouts, so that a new task needs no manual scaling.
 
-    :return: both, and the training state with its random key moved on
+    :return: workspace, scales, and the training state with a new random key
     """
     key = jax.random.wrap_key_data(progress.key, impl=GENERATOR)
     key, k_starts, k_plans = jax.random.split(key, 3)
@@ -258,20 +181,15 @@ def init_workspace(
     return workspace, scales, progress._replace(key=jax.random.key_data(key))
 
 
-def clipped_adam(max_grad_norm: float) -> optax.GradientTransformation:
-    """Adam without its learning rate, which is a knob."""
-    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam(0.9, 0.99))
-
-
 def resets(twin: Twin, params: Params, key: PRNGKeyArray, n: int) -> State:
     """:return: ``n`` states at the start of an episode"""
     return jax.vmap(lambda k: twin.initial(k, params))(jax.random.split(key, n))
 
 
-def for_each(function: Callable, *rows: Any) -> Any:
+def grouped_vmap(function: Callable, *rows: Any) -> Any:
     """
-    ``jax.vmap`` over two axes instead of one: on a CPU, XLA multiplies thin matrices twice as fast
-    when they have a batch dimension, which is most of what following a policy costs.
+    ``jax.vmap`` over two axes instead of one: on a CPU, XLA multiplies thin matrices, the main cost
+    of rolling out a policy, twice as fast with a batch dimension.
 
     :param function: of one row
     :param rows: pytrees whose leaves have a leading axis of one length
@@ -285,12 +203,12 @@ def for_each(function: Callable, *rows: Any) -> Any:
 
 
 def longest_episode(twin: Twin) -> int:
-    """:return: steps after which an episode is cut off, also where the twin declares no limit"""
+    """:return: steps after which an episode is truncated, also if the twin declares no limit"""
     return twin.max_episode_steps or _LONG_EPISODE
 
 
-def problem_of(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Problem:
-    """:return: what the planner maximises with the networks as they are now"""
+def planning_problem(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Problem:
+    """:return: the planning problem with the current networks"""
 
     def roots(obs: Obs) -> jax.Array:
         seen = state.networks.inside(hyper.view(obs))
@@ -312,18 +230,13 @@ def problem_of(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Pr
     )
 
 
-def _unclipped() -> jax.Array:
-    """Of a dtype of its own: one that adapts would be another program than a loaded model's."""
-    return jnp.full((), jnp.inf, jnp.float32)
-
-
 def _input_scales(seen: jax.Array, plans: Plan) -> View:
     lived = plans.alive[..., None] & jnp.isfinite(seen)
     count = jnp.maximum(jnp.sum(lived, (0, 1)), 1)
     mean = jnp.sum(jnp.where(lived, seen, 0.0), (0, 1)) / count
     variance = jnp.sum(jnp.where(lived, (seen - mean) ** 2, 0.0), (0, 1)) / count
     scale = jnp.sqrt(variance)
-    return View(mean, jnp.where(scale > 1e-6, scale, 1.0), _unclipped())
+    return View(mean, jnp.where(scale > 1e-6, scale, 1.0), unclipped())
 
 
 def _best_reward(plans: Plan) -> jax.Array:
@@ -333,7 +246,7 @@ def _best_reward(plans: Plan) -> jax.Array:
 
 
 def _typical_shortfall(plans: Plan, offset: jax.Array, discount: float) -> jax.Array:
-    """Geometric mean of what rollouts lose on the best reward, as if they went on as they did."""
+    """Geometric mean of the rollouts' loss against the best reward, extrapolated to all steps."""
     counted = plans.alive[:, :-1] & jnp.isfinite(plans.rewards)
     weights = jnp.where(counted, discount ** jnp.arange(plans.rewards.shape[1]), 0.0)
     shortfalls = jnp.where(counted, plans.rewards - offset, 0.0)

@@ -1,1 +1,1 @@
-"""Soft actor-critic and its relatives."""
+"""Soft actor-critic (SAC) and the algorithms that extend it."""

@@ -1,4 +1,4 @@
-"""The shell of the SAC family."""
+"""What the SAC family shares, and SAC itself, with gSDE unless it is switched off."""
 
 import dataclasses
 import math
@@ -16,18 +16,18 @@ from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from sb3_hds.algos.base.config import between, takes
 from sb3_hds.algos.base.construct import jax_device
 from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
-from sb3_hds.algos.model_free.sac.objectives import squared_error
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free.sac.update import (
     Hyperparams,
     UpdateConfig,
     UpdateMetrics,
     log_of,
+    squared_error,
     update,
 )
 from sb3_hds.algos.model_free.update import batches_of, zero_metrics
 
-# Updates of one compiled call; more are made in several.
+# Updates per compiled call.
 _MOST_UPDATES = 64
 
 
@@ -37,13 +37,13 @@ class SACConfig(ModelFreeConfig):
     Arguments of the SAC family.
 
     :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"`` to start there
-    :param target_entropy: a number, or ``"auto"``: minus the number of controls; of SimBa and BRO,
+    :param target_entropy: a number, or ``"auto"``: minus the number of actions, with SimBa and BRO
         half of that
     :param linear_ent_coef: whether the loss of the entropy coefficient is linear in the coefficient
-        itself, as equation 18 of the paper, not in its logarithm, as in SB3, SBX and the authors'
-        code of DroQ and TQC
+        itself, as in equation 18 of the paper, instead of in its logarithm, as in SB3, SBX and the
+        authors' code of DroQ and TQC
     :param target_update_interval: updates of the critics between two updates of the target critics,
-        counted from the first; SB3 restarts counting in each call of ``train``
+        counted from the first; SB3 restarts the count in each call of ``train``
     """
 
     _: KW_ONLY
@@ -74,33 +74,33 @@ class SoftActorCritic(ModelFreeAlgorithm):
         "SimbaPolicy": SimbaPolicy,
     }
     policy_family = GaussianPolicy
-    #: fields of the state that ``param_resets`` leaves as they are
-    kept_by_restarts: ClassVar[tuple[str, ...]] = ("log_ent_coef", "obs_stats", "n_updates")
+    # With the entropy coefficient and its optimiser, as in SBX.
+    kept_by_restarts = ("log_ent_coef", "obs_stats", "n_updates")
     policy: GaussianPolicy
     ent_coef: float | str
     target_entropy: float | str
 
     config_class = SACConfig
-    #: arguments of the policy unless they are given
-    usual_policy_kwargs: ClassVar[Mapping[str, Any]] = {}
+    #: the algorithm's defaults for arguments of the policy
+    default_policy_kwargs: ClassVar[Mapping[str, Any]] = {}
 
     @takes(SACConfig)
     def __init__(self, config: SACConfig) -> None:
         self.construct(config)
 
     def construct(self, config: SACConfig, **more: Any) -> None:  # type: ignore[override]
-        policy_kwargs = {**self.usual_policy_kwargs, **(config.policy_kwargs or {})}
+        policy_kwargs = {**self.default_policy_kwargs, **(config.policy_kwargs or {})}
         super().construct(dataclasses.replace(config, policy_kwargs=policy_kwargs), **more)
 
     def update_config(self) -> UpdateConfig:
         """
-        What an update is made of: SAC's for the networks of the policy, see
-        ``GaussianPolicy.plain_update_config``, with the arguments of this algorithm. Subclasses
+        Config of the update: that of SAC for the networks of the policy
+        (``GaussianPolicy.sac_update_config``) with the arguments of this algorithm. Subclasses
         replace parts of it.
         """
         config = self.config
         return dataclasses.replace(
-            self.policy.plain_update_config(),
+            self.policy.sac_update_config(),
             policy_delay=config.policy_delay,
             target_update_interval=config.target_update_interval,
             learns_ent_coef=isinstance(config.ent_coef, str),
@@ -108,7 +108,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         )
 
     def auto_target_entropy(self) -> float:
-        """:return: what ``target_entropy="auto"`` means here"""
+        """:return: the value of ``target_entropy="auto"``"""
         return -float(self.policy.n_act)
 
     def check_environment(self, config: Any) -> None:
@@ -135,8 +135,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
     ) -> None:
         super().set_parameters(load_path_or_dict, exact_match, device)
         if not isinstance(self.ent_coef, str):
-            # A fixed coefficient is an argument, not learned: keep this model's own value. ``load``
-            # calls this, too.
+            # A fixed coefficient is an argument, so keep this model's value; `load` gets here, too.
             before = self.policy.agent_state.log_ent_coef
             fixed = {"params": log_of(self.ent_coef)}
             now = before._replace(weights=fixed)
@@ -152,27 +151,20 @@ class SoftActorCritic(ModelFreeAlgorithm):
             )
         self.policy.build(config, start, seed, device)
 
-    def _restart(self, seed: int) -> None:
-        """The entropy coefficient stays with its optimiser, as in SBX, but for BRO."""
-        before = self.policy.agent_state
-        self._build(seed)
-        kept = {name: getattr(before, name) for name in self.kept_by_restarts}
-        self.policy.agent_state = self.policy.agent_state._replace(**kept)
-
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
         policy, hyper, report, found = self.policy, self.hyper(), {}, zero_metrics(UpdateMetrics)
         for done in range(0, n, _MOST_UPDATES):
             now = min(_MOST_UPDATES, n - done)
-            batches = batches_of(self.replay_source, now, batch_size, _capacity(now))
+            batches = batches_of(self.replay_source, now, batch_size, next_power_of_2(now))
             state, found = update(
                 policy.update_config, policy.agent_state, batches, now, hyper, found
             )
-            report = _plain(found)
-            self._take(state, report)
+            report = {name: float(x) for name, x in jax.device_get(found)._asdict().items()}
+            self._accept(state, report)
         return report
 
     def hyper(self) -> Hyperparams:
-        """:return: what schedules make of the arguments, at this point of the training"""
+        """:return: the current values of the hyperparameters that may change"""
         rate, qf_rate = self.learning_rates()
         entropy = self.target_entropy
         wanted = self.auto_target_entropy() if entropy == "auto" else float(entropy)
@@ -182,24 +174,61 @@ class SoftActorCritic(ModelFreeAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         # SB3 has drawn noise matrices at the start of the collection.
-        if self.use_sde and self.sde_sample_freq > 0 and self._collects_steps():
+        by_steps = self.train_freq.unit == TrainFrequencyUnit.STEP  # type: ignore[union-attr]
+        if self.use_sde and self.sde_sample_freq > 0 and by_steps:
             self.policy.keep_noise(n_envs, self.sde_sample_freq)
         return super()._sample_action(learning_starts, action_noise, n_envs)
-
-    def _collects_steps(self) -> bool:
-        freq: Any = self.train_freq
-        return freq.unit == TrainFrequencyUnit.STEP
 
     def stored(
         self, new_obs: np.ndarray | dict[str, np.ndarray], reward: np.ndarray, dones: np.ndarray
     ) -> None:
-        self.policy.observed(new_obs)
+        self.policy.update_obs_stats(new_obs)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class GSDESACConfig(SACConfig):
+    """
+    Arguments of gSDE-SAC.
+
+    :param use_sde: False: independent noise at each step; with ``train_freq=1, gradient_steps=1``
+        that is plain SAC
+    :param policy_kwargs: ``log_std_init``, ``full_std``, ``use_expln``, ``clip_mean`` and the other
+        arguments of :class:`~sb3_hds.algos.GaussianPolicy`
+    """
+
+    _: KW_ONLY
+    use_sde: bool = True
+    train_freq: int | tuple[int, str] | None = 8
+    gradient_steps: int = 8
+
+
+class GSDESAC(SoftActorCritic):
+    r"""
+    SAC that explores by :math:`a = \mu(s) + \theta^T z(s)` with a noise matrix :math:`\theta` that
+    is redrawn every few steps: smooth, state-dependent exploration that does not wear out motors.
+
+    Source: Raffin, Kober and Stulp, *Smooth Exploration for Robotic Reinforcement Learning*, CoRL
+    2021, based on Haarnoja et al., *Soft Actor-Critic Algorithms and Applications*, 2018. The
+    features of the actor, the learned standard deviations (``log_std_init``, ``full_std``,
+    ``use_expln``), ``clip_mean``, the marginal variance in the log-probability and
+    ``use_sde_at_warmup`` are those of SB3; SBX draws noise that does not depend on the state and
+    reports a standard deviation of 0. Unlike SB3, updates draw the noise of each state
+    independently: from the same distribution, with less variance of the gradient. Without
+    ``sde_sample_freq``, each collection of ``train_freq`` steps starts with new noise.
+    """
+
+    config_class = GSDESACConfig
+
+    @takes(GSDESACConfig)
+    def __init__(self, config: GSDESACConfig) -> None:
+        self.construct(config)
 
 
 def initial_ent_coef(ent_coef: float | str) -> float:
     """
-    :raises ValueError: for anything but a number of at least 0, ``"auto"`` or ``"auto_NUMBER"``,
-        which is above 0
+    :return: the first value of the entropy coefficient
+    :raises ValueError: for anything but a number of at least 0, ``"auto"``, or ``"auto_NUMBER"``
+        with a number above 0
     """
     start: Any = ent_coef
     if isinstance(ent_coef, str):
@@ -218,10 +247,6 @@ def initial_ent_coef(ent_coef: float | str) -> float:
     return value
 
 
-def _capacity(n: int) -> int:
-    """:return: the power of 2 from ``n`` on: few sizes are few compiled programs"""
+def next_power_of_2(n: int) -> int:
+    """:return: the least power of 2 that is at least ``n``: few sizes are few compiled programs"""
     return 1 << (n - 1).bit_length()
-
-
-def _plain(report: UpdateMetrics) -> dict[str, float]:
-    return {name: float(value) for name, value in jax.device_get(report)._asdict().items()}

@@ -15,33 +15,42 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.model_free.sac.algorithm import SACConfig, SoftActorCritic
-from sb3_hds.algos.model_free.sac.objectives import mean_q, mean_values, quantile_huber
+from sb3_hds.algos.model_free.sac.networks import (
+    ORTHOGONAL,
+    ORTHONORMAL,
+    Gaussian,
+    Hidden,
+    Last,
+    orthogonal,
+    squashed_between,
+)
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, GaussianPolicyConfig
+from sb3_hds.algos.model_free.sac.tqc import quantile_huber
 from sb3_hds.algos.model_free.sac.update import (
     Hyperparams,
     SACState,
     UpdateConfig,
-    actor_distribution,
+    forward,
+    mean_q,
+    mean_values,
     q_values,
 )
 from sb3_hds.algos.model_free.update import Batch
-from sb3_hds.algos.nets.heads import Gaussian, squashed_between
-from sb3_hds.algos.nets.mlp import ORTHOGONAL, ORTHONORMAL, BroNet, Last, orthogonal
-from sb3_hds.algos.nets.options import Optimizer, TrainState, Weights
+from sb3_hds.algos.nets.options import Activation, Optimizer, TrainState, Weights
 
-# Steps of the environment at which the authors reset the networks: with the full replay ratio,
-# and with the fast one of 2.
+# Environment steps at which the authors reset the networks: with the full replay ratio, and with
+# the fast variant's ratio of 2.
 _RESETS = (15_000, 50_000, 250_000, 500_000, 750_000, 1_000_000, 1_500_000, 2_000_000)
 _FAST, _FAST_RESETS = 2, _RESETS[:1]
 _INITIAL_OPTIMISM, _INITIAL_REGULARIZER = 1.0, 0.25
-# Of the logarithms of the multipliers.
+# Limits of the logarithms of the multipliers.
 _MULTIPLIER_LIMITS = (-10.0, 7.5)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BroPolicyConfig(GaussianPolicyConfig):
     """
-    Arguments of ``BroPolicy``; the optimiser is AdamW with the weight decay of the paper.
+    Arguments of ``BroPolicy``; the default optimiser is AdamW with the paper's weight decay.
 
     :param net_arch: ``{"pi": [256], "qf": [512, 512]}`` by default
     """
@@ -49,15 +58,15 @@ class BroPolicyConfig(GaussianPolicyConfig):
     net_arch: Sequence[int] | Mapping[str, Sequence[int]] = dataclasses.field(
         default_factory=lambda: {"pi": (256,), "qf": (512, 512)}
     )
-    usual_optimizer = ("adamw", {"weight_decay": 1e-4})
-    squashes = True
+    default_optimizer = ("adamw", {"weight_decay": 1e-4})
+    default_squash_log_std = True
     unused = ("renorm_warmup_steps", "dropout_rate", "ortho_init")
 
 
 class BroPolicy(GaussianPolicy):
     """
-    BroNets of the paper's widths. Where it explores, it acts by the optimistic actor, where it does
-    not, by the other one.
+    BroNets of the paper's widths. Exploratory actions are the optimistic actor's, deterministic
+    ones those of the (conservative) actor.
     """
 
     narrow = 128
@@ -81,13 +90,13 @@ class BROConfig(SACConfig):
     """
     Arguments of BRO.
 
-    :param kl_target: divergence of the optimistic actor from the other one, per control
-    :param std_multiplier: standard deviation of the optimistic actor, in units of the other one's
+    :param kl_target: divergence of the optimistic actor from the actor, per action
+    :param std_multiplier: standard deviation of the optimistic actor, in units of the actor's
     :param multiplier_rate: learning rate of the multipliers, in units of ``learning_rate``, whose
         schedule it follows; 3e-5 by default
-    :param param_resets: steps at which all networks are reset; None: the paper's, of which only the
-        first with ``gradient_steps`` of at most 2; ``[]``: never
-    :param policy_kwargs: ``n_quantiles`` is 100 unless given; see
+    :param param_resets: steps at which all networks are reset; None: the paper's, with
+        ``gradient_steps`` of at most 2 only the first of them; ``[]``: never
+    :param policy_kwargs: ``n_quantiles`` is 100 by default; see
         :class:`~sb3_hds.algos.GaussianPolicy`
     """
 
@@ -109,21 +118,20 @@ class BROConfig(SACConfig):
 class BRO(SoftActorCritic):
     r"""
     Bigger, regularised, optimistic: BroNet critics with 100 quantiles, of which targets and actor
-    use the **mean**; a second actor that explores where the critics disagree; and resets of the
-    networks.
+    use the **mean**; a second, optimistic actor that explores where the critics disagree; and
+    resets of the networks.
 
     Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
     sample-efficient continuous control*, NeurIPS 2024: replay ratio 10 (``gradient_steps=10``; here
     2, their fast variant, which two cores can train), batches of 128, AdamW with 3e-4, target
-    entropy of minus half the number of controls, Adam with b1 = 0.5 for the temperature and the
-    multipliers. Their first values are no arguments (optimism 1, regulariser 0.25). As in the
-    authors' code (MIT licence), fresh starts include the temperature, the multipliers and all
-    optimisers, and the logarithms of multipliers and of the deviation of actions are squashed into
-    their limits by :math:`\tanh`: actions start with a deviation near :math:`e^{-4}`, not near 1 as
-    with SAC. Its quantile loss is a sum over quantiles where this is their mean, a factor that Adam
-    takes out again. The loss of the entropy coefficient has the coefficient itself, as theirs. With
-    ``use_sde=True``, which the paper does not have, the optimistic actor explores by gSDE's noise.
-    SBX has no BRO.
+    entropy of minus half the number of actions, Adam with b1 = 0.5 for the temperature and the
+    multipliers, which start at 1 (optimism) and 0.25 (regulariser). As in the authors' code (MIT
+    licence), resets include the temperature, the multipliers and all optimisers; :math:`\tanh`
+    squashes the logarithms of the multipliers and ``log_std`` of the actions into their limits, so
+    that the standard deviation starts near :math:`e^{-4}`, not near 1 as with SAC; and the loss of
+    the entropy coefficient is linear in the coefficient. Their quantile loss is a sum over
+    quantiles, here it is a mean; Adam cancels the factor. With ``use_sde=True``, which the paper
+    does not have, the optimistic actor explores by gSDE's noise. SBX has no BRO.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -133,7 +141,7 @@ class BRO(SoftActorCritic):
     kept_by_restarts = ("obs_stats", "n_updates")
 
     config_class = BROConfig
-    usual_policy_kwargs = {"n_quantiles": 100}
+    default_policy_kwargs = {"n_quantiles": 100}
 
     @takes(BROConfig)
     def __init__(self, config: BROConfig) -> None:
@@ -141,7 +149,7 @@ class BRO(SoftActorCritic):
 
     def construct(self, config: BROConfig, **more: Any) -> None:  # type: ignore[override]
         if config.param_resets is None:
-            # -1: one for each step.
+            # -1 means one update per step.
             resets = _FAST_RESETS if config.gradient_steps <= _FAST else _RESETS
             config = dataclasses.replace(config, param_resets=list(resets))
         super().construct(config, **more)
@@ -168,12 +176,38 @@ class BRO(SoftActorCritic):
         )
 
 
+class BroNet(nn.Module):
+    """
+    Residual blocks with layer norm after each dense layer.
+
+    Source: Nauman et al., *Bigger, Regularized, Optimistic: scaling for compute and
+    sample-efficient continuous control*, NeurIPS 2024, section 3 (BroNet).
+
+    :param net_arch: width of each block; a dense layer precedes a block of another width; empty:
+        the identity
+    :param activation_fn: between the layers
+    """
+
+    net_arch: Sequence[int]
+    activation_fn: Activation
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch n"], train: bool) -> Float[Array, "*batch m"]:
+        dense = lambda width: Hidden(width, kernel_init=ORTHOGONAL)  # noqa: E731
+        for i, width in enumerate(self.net_arch):
+            if i == 0 or x.shape[-1] != width:
+                x = self.activation_fn(nn.LayerNorm()(dense(width)(x)))
+            inside = self.activation_fn(nn.LayerNorm()(dense(width)(x)))
+            x = x + nn.LayerNorm()(dense(width)(inside))
+        return x
+
+
 class MeanShift(nn.Module):
     """
-    How far the optimistic actor's mean is from the other one's.
+    Difference between the means of the optimistic actor and the actor.
 
-    :param body: see ``mlp.py``
-    :param n_act: number of controls
+    :param body: hidden layers
+    :param n_act: number of actions
     """
 
     body: nn.Module
@@ -191,14 +225,15 @@ class MeanShift(nn.Module):
 @dataclasses.dataclass(frozen=True)
 class OptimisticActor:
     r"""
-    The actor that explores: it maximises :math:`Q_\mu + \beta\, Q_\sigma`, mean and half difference
-    of the critics, minus :math:`\tau` times its divergence from the other actor. Both multipliers
-    are adapted to a target of the divergence (section 3 of the paper).
+    The actor that explores. It maximises :math:`Q_\mu + \beta\, Q_\sigma`, the mean and half the
+    difference of the critics, minus :math:`\tau` times its divergence from the actor. The
+    multipliers :math:`\beta` and :math:`\tau` are adapted to a target of the divergence (section 3
+    of the paper).
 
     :param network: a ``MeanShift``
     :param optimizer: of the shift
-    :param kl_target: divergence, per control
-    :param std_multiplier: its standard deviation, in units of the other one's
+    :param kl_target: divergence from the actor, per action
+    :param std_multiplier: its standard deviation, in units of the actor's
     :param multiplier_rate: learning rate of the multipliers, in units of the actor's
     """
 
@@ -212,9 +247,9 @@ class OptimisticActor:
         n_act = cast(Any, self.network).n_act
         weights = self.network.init(key, obs, jnp.zeros((1, n_act)))
         multipliers = {"optimism": _INITIAL_OPTIMISM, "regularizer": _INITIAL_REGULARIZER}
-        fresh = {name: {"params": _before(math.log(start))} for name, start in multipliers.items()}
-        return {"actor": TrainState(weights, self.optimizer.init(weights["params"]))} | {
-            name: TrainState(raw, _MULTIPLIER.init(raw["params"])) for name, raw in fresh.items()
+        return {"actor": self.optimizer.train_state(weights)} | {
+            name: _MULTIPLIER.train_state({"params": _before(math.log(start))})
+            for name, start in multipliers.items()
         }
 
     def update(
@@ -227,7 +262,7 @@ class OptimisticActor:
     ) -> Any:
         act_key, q_key = jax.random.split(key)
         own, critics = state.extra, state.critic.weights
-        gaussian, _ = actor_distribution(config.actor, state.actor.weights, batch.obs)
+        gaussian, _ = forward(config.actor, state.actor.weights, batch.obs)
         optimism, regularizer = (
             _multiplier(own[name].weights["params"]) for name in ("optimism", "regularizer")
         )
@@ -259,12 +294,12 @@ class OptimisticActor:
 
 
 def _multiplier(raw: Array) -> Array:
-    """:return: a multiplier, of what is learned for it"""
+    """:return: the multiplier with this learned parameter"""
     return jnp.exp(squashed_between(raw, *_MULTIPLIER_LIMITS))
 
 
 def _before(log: float) -> Array:
-    """:return: what is squashed into that logarithm of a multiplier"""
+    """:return: the parameter that is squashed into this logarithm of a multiplier"""
     low, high = _MULTIPLIER_LIMITS
     return jnp.asarray(math.atanh(2.0 * (log - low) / (high - low) - 1.0), jnp.float32)
 

@@ -1,4 +1,4 @@
-"""Several seeds of an algorithm at once, in the twin of its environment and in one program."""
+"""Learning with several seeds in one compiled program, in the twin of the environment."""
 
 import io
 import warnings
@@ -14,7 +14,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from sb3_hds.algos.base.config import is_count
-from sb3_hds.algos.model_free.sac.algorithm import SoftActorCritic
+from sb3_hds.algos.model_free.sac.algorithm import SoftActorCritic, next_power_of_2
 from sb3_hds.algos.model_free.sac.compiled_run import (
     Loop,
     Round,
@@ -39,9 +39,9 @@ _NO_LIMIT = np.iinfo(np.int32).max
 
 class Episodes(NamedTuple):
     """
-    What the episodes of one seed earned while it learned.
+    Training episodes of one seed.
 
-    :param timesteps: when each of them ended
+    :param timesteps: timestep at the end of each episode
     :param returns: undiscounted sums of rewards
     """
 
@@ -57,62 +57,67 @@ def learn_compiled(
     twin: Twin | None = None,
 ) -> tuple[list[Algorithm], list[Episodes]]:
     """
-    Learn from scratch, once for each seed, without leaving the accelerator: the environment is its
-    twin, stepped inside the program that also updates.
+    Learn from scratch with each seed, without leaving the accelerator: the same program steps the
+    twin of the environment and updates the networks.
 
-    Compiled once for all numbers of steps up to 16,384, again where they double, or ``buffer_size``
-    is less, and for another number of seeds. What SB3 does around its steps is not done: callbacks,
-    loggers, monitors. Schedules act round by round. Interrupted (Ctrl-C), it returns what was
-    learned by then.
+    It is compiled once for all ``total_timesteps`` up to 16,384, again for each doubling, for a
+    smaller ``buffer_size``, and for another number of seeds. Callbacks, loggers and monitors are
+    not called. Schedules act round by round. Interrupted (Ctrl-C), it returns what was learned
+    until then.
 
-    :param model: says how to learn, and is left as it is: any algorithm of the SAC family, with an
-        environment that has a twin; BRO resets its networks after 15,000 steps unless it is made
-        with ``param_resets=[]``, and so is refused for more
-    :param total_timesteps: of each seed, rounded up to whole rounds of ``train_freq``
-    :param seeds: begin with the networks that the algorithm has with this seed
-    :param progress_bar: show one
-    :param twin: to step in place of the one that the environment, as wrapped, is known to have
-    :return: for each seed a model that can act, be saved, and go on learning from the transitions
-        that it saw, and its episodes
+    :param model: hyperparameters and environment, not changed: any algorithm of the SAC family
+        whose environment has a twin; BRO resets its networks after 15,000 steps and is refused for
+        more, unless it is made with ``param_resets=[]``
+    :param total_timesteps: of each seed, rounded up to full rounds of ``train_freq``
+    :param seeds: of the initial networks, as in the constructor, and of the training
+    :param progress_bar: whether to show a progress bar
+    :param twin: stepped instead of the twin that belongs to the environment with its wrappers
+    :return: for each seed a model that can act, be saved, and continue learning from its
+        transitions; and its episodes
     :raises NoTwinError: for an environment without a twin
     :raises EnvironmentMismatchError: for a wrapper that its twin does not have, and for a twin with
         other actions or observations
-    :raises ValueError: for what only steps in Python can do: other algorithms, several
+    :raises ValueError: for features that need steps in Python: other algorithms, several
         environments, ``VecNormalize``, another replay buffer, ``optimize_memory_usage``, n-step
         returns, action noise, ``param_resets``, episodes as ``train_freq``, a layer that stores
-        what was executed
-    :raises SeedsDivergedError: if a seed diverged, when the others are done; it has what they
-        learned
+        executed actions
+    :raises SeedsDivergedError: if a seed diverged, after the others are done; it has their models
+        and episodes
     """
     if not isinstance(seeds, Iterable):
         raise ValueError(f"learn_compiled(seeds={seeds!r}): pass several, such as range(4).")
     seeds = [int(seed) for seed in seeds]
     _refuse_what_needs_python(model, total_timesteps, seeds)
     models = [_copy_of(model, seed) for seed in seeds]
-    loop = _loop_of(models[0], total_timesteps, _twin_for(model.get_env(), twin))
-    runs, done = _begun(loop, models, seeds), []
-    lost = np.zeros(len(seeds), bool)
+    env: Any = model.get_env()
+    if twin is None:
+        twin = twin_of(env)
+    else:
+        check_mirrors(env, twin)
+    loop = _loop_of(models[0], total_timesteps, twin)
+    runs, done = _initial_runs(loop, models, seeds), []
+    diverged = np.zeros(len(seeds), bool)
     try:
-        for rounds in _calls(model, loop, total_timesteps, progress_bar):
+        for rounds in _rounds_of_calls(model, loop, total_timesteps, progress_bar):
             runs, now, report = run_rounds(loop, loop.twin.params, runs, rounds)
             done.append((now, rounds))
-            lost |= _diverged(report)
-            if lost.all():
+            diverged |= _diverged(report)
+            if diverged.all():
                 break
     except KeyboardInterrupt:
-        n_done = _n_steps([_that_happened(*call) for call in done])
+        n_done = _n_steps([_without_padding(*call) for call in done])
         warnings.warn(f"Interrupted after {n_done} of {total_timesteps} steps.")
-    steps = [_that_happened(*call) for call in done]
-    whole = jax.device_get(runs._replace(key=jax.random.key_data(runs.key)))
-    kept = np.flatnonzero(~lost).tolist()
+    steps = [_without_padding(*call) for call in done]
+    on_host = jax.device_get(runs._replace(key=jax.random.key_data(runs.key)))
+    kept = np.flatnonzero(~diverged).tolist()
     for i in kept:
-        _take_over(models[i], _of_seed(runs, i), _of_seed(whole, i), _n_steps(steps))
+        _continue_from(models[i], _of_seed(runs, i), _of_seed(on_host, i), _n_steps(steps))
     episodes = [_episodes(steps, i) for i in range(len(seeds))]
-    if lost.any():
+    if diverged.any():
         raise SeedsDivergedError(
-            f"Learning diverged with the seeds {[seeds[i] for i in np.flatnonzero(lost)]}. Lower "
-            "the learning rate, or scale rewards. What others learned is in this error's models "
-            "and episodes.",
+            f"Learning diverged with the seeds {[seeds[i] for i in np.flatnonzero(diverged)]}. "
+            "Lower the learning rate, or scale rewards. The models and episodes of the other seeds "
+            "are attributes of this error.",
             {seeds[i]: models[i] for i in kept},
             {seeds[i]: episodes[i] for i in kept},
         )
@@ -122,7 +127,7 @@ def learn_compiled(
 def _refuse_what_needs_python(model: Any, total_timesteps: Any, seeds: Sequence[int]) -> None:
     if not isinstance(model, SoftActorCritic):
         raise ValueError(
-            f"learn_compiled() knows the SAC family, not {type(model).__name__}: use its learn()."
+            f"learn_compiled() is for the SAC family, not {type(model).__name__}: use its learn()."
         )
     if not is_count(total_timesteps, 1) or not seeds:
         raise ValueError(
@@ -155,7 +160,10 @@ def _refuse_what_needs_python(model: Any, total_timesteps: Any, seeds: Sequence[
             not isinstance(model.observation_space, spaces.Box),
             "flatten them",
         ),
-        "layers with store='executed'": (_stores_executed(model.get_env()), "use store='raw'"),
+        "layers with store='executed'": (
+            _attribute(model.get_env(), "store") == "executed",
+            "use store='raw'",
+        ),
     }
     for what, (is_so, remedy) in unfit.items():
         if is_so:
@@ -165,16 +173,16 @@ def _refuse_what_needs_python(model: Any, total_timesteps: Any, seeds: Sequence[
             )
 
 
-def _stores_executed(env: Any) -> bool:
-    """:return: whether the outermost layer asks for it"""
+def _attribute(env: Any, name: str) -> Any:
+    """:return: of the environment, or of its outermost layer that has it; None: there is none"""
     try:
-        return "executed" in env.get_attr("store")
+        return env.get_attr(name)[0]
     except AttributeError:
-        return False
+        return None
 
 
 def _copy_of(model: Algorithm, seed: int) -> Algorithm:
-    """:return: the same, as if it had been made with this seed"""
+    """:return: a copy of the model, as if constructed with this seed"""
     file = io.BytesIO()
     model.save(file)
     file.seek(0)
@@ -184,21 +192,17 @@ def _copy_of(model: Algorithm, seed: int) -> Algorithm:
     return copy
 
 
-def _twin_for(env: Any, given: Twin | None) -> Twin:
-    if given is None:
-        return twin_of(env)
-    check_mirrors(env, given)
-    return given
-
-
 def _loop_of(model: SoftActorCritic, total_timesteps: int, twin: Twin) -> Loop:
     env: Any = model.get_env()
     frequency = model.train_freq.frequency  # type: ignore[union-attr]
+    n_steps = _rounded_up(total_timesteps, frequency)
     return Loop(
         twin=twin,
         update_config=model.policy.update_config,
-        limit=_limit_of(env),
-        capacity=min(model.buffer_size, _capacity(_rounded_up(total_timesteps, frequency))),
+        limit=_attribute(env, "_max_episode_steps")
+        or _attribute(env, "max_episode_steps")
+        or _NO_LIMIT,
+        capacity=min(model.buffer_size, max(_LEAST_CAPACITY, next_power_of_2(n_steps))),
         learning_starts=model.learning_starts,
         train_freq=frequency,
         gradient_steps=frequency if model.gradient_steps == -1 else model.gradient_steps,
@@ -209,18 +213,8 @@ def _loop_of(model: SoftActorCritic, total_timesteps: int, twin: Twin) -> Loop:
     )
 
 
-def _limit_of(env: Any) -> int:
-    """:return: steps after which the environment cuts an episode off"""
-    for name in ("_max_episode_steps", "max_episode_steps"):
-        try:
-            return env.get_attr(name)[0] or _NO_LIMIT
-        except AttributeError:
-            continue
-    return _NO_LIMIT
-
-
-def _begun(loop: Loop, models: Sequence[SoftActorCritic], seeds: Sequence[int]) -> Run:
-    """Each seed has random numbers of its own, which do not depend on the seeds beside it."""
+def _initial_runs(loop: Loop, models: Sequence[SoftActorCritic], seeds: Sequence[int]) -> Run:
+    """Initial runs; the random numbers of a seed do not depend on the other seeds."""
     singles = []
     for model, seed in zip(models, seeds, strict=True):
         network_key, key = jax.random.split(jax.random.key(seed, impl="threefry2x32"))
@@ -228,43 +222,43 @@ def _begun(loop: Loop, models: Sequence[SoftActorCritic], seeds: Sequence[int]) 
         singles.append(init_run(loop, loop.twin.params, state, key))
     stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *singles)
     state = stacked.agent._replace(n_updates=singles[0].agent.n_updates)
-    # What a program returns has a device of its own: arrays without would be compiled for apart.
+    # Results of a program are committed to a device; uncommitted arrays would compile another one.
     (device,) = models[0].policy.agent_state.key.devices()
     return jax.device_put(stacked._replace(agent=state), device)
 
 
-def _calls(
+def _rounds_of_calls(
     model: SoftActorCritic, loop: Loop, total_timesteps: int, progress_bar: bool
 ) -> Iterable[Round]:
-    """The rounds of each call of the program, with the rates that the schedules have then."""
+    """The rounds of each call of the program, with the hyperparameters of their schedules."""
     total = _rounded_up(total_timesteps, loop.train_freq)
     begins = np.arange(0, total, loop.train_freq)
-    table = np.array([_knobs_at(model, 1.0 - begin / total) for begin in begins], np.float32)
+    table = np.array([_hyper_at(model, 1.0 - begin / total) for begin in begins], np.float32)
     per_call = max(1, _STEPS_PER_CALL // loop.train_freq)
     calls = [
-        _filled_up(begins[at : at + per_call], table[at : at + per_call], per_call)
+        _padded(begins[at : at + per_call], table[at : at + per_call], per_call)
         for at in range(0, len(begins), per_call)
     ]
     return track(calls, "learning", disable=not progress_bar)
 
 
-def _knobs_at(model: SoftActorCritic, remaining: float) -> Hyperparams:
+def _hyper_at(model: SoftActorCritic, remaining: float) -> Hyperparams:
     now, model._current_progress_remaining = model._current_progress_remaining, remaining
     hyper = model.hyper()
     model._current_progress_remaining = now
     return hyper
 
 
-def _filled_up(begins: np.ndarray, table: np.ndarray, n: int) -> Round:
+def _padded(begins: np.ndarray, table: np.ndarray, n: int) -> Round:
     more = n - len(begins)
-    happens = np.arange(n) < len(begins)
+    active = np.arange(n) < len(begins)
     begins, table = np.pad(begins, (0, more)), np.pad(table, ((0, more), (0, 0)))
     columns: Any = jnp.asarray(table).T
-    return Round(jnp.asarray(begins, jnp.int32), jnp.asarray(happens), Hyperparams(*columns))
+    return Round(jnp.asarray(begins, jnp.int32), jnp.asarray(active), Hyperparams(*columns))
 
 
-def _take_over(model: SoftActorCritic, run: Run, on_host: Run, n_steps: int) -> None:
-    """The model goes on from where the run is."""
+def _continue_from(model: SoftActorCritic, run: Run, on_host: Run, n_steps: int) -> None:
+    """Continue the model from the end of the run."""
     key = jax.random.key(int(on_host.key[-1]), impl=GENERATOR)
     device = next(iter(model.policy.agent_state.key.devices()))
     model.policy.agent_state = jax.device_put(run.agent._replace(key=key), device)
@@ -302,8 +296,8 @@ def _episodes(steps: Sequence[Step], i: int) -> Episodes:
     return Episodes(1 + np.flatnonzero(ended), totals[ended])
 
 
-def _that_happened(steps: Step, rounds: Round) -> Step:
-    n = int(rounds.happens.sum())
+def _without_padding(steps: Step, rounds: Round) -> Step:
+    n = int(rounds.active.sum())
     return jax.tree.map(lambda x: np.asarray(x)[:, :n], steps)
 
 
@@ -312,14 +306,9 @@ def _n_steps(steps: Sequence[Step]) -> int:
 
 
 def _diverged(report: Any) -> np.ndarray:
-    """:return: of each seed, whether a number of its last updates is not finite"""
+    """:return: of each seed, whether a metric of its last update is not finite"""
     values = jax.device_get(report)
     return ~np.logical_and.reduce([np.isfinite(value) for value in values])
-
-
-def _capacity(n: int) -> int:
-    """:return: a power of 2 from ``n`` on: few sizes are few compiled programs"""
-    return max(_LEAST_CAPACITY, 1 << (n - 1).bit_length())
 
 
 def _rounded_up(total_timesteps: int, frequency: int) -> int:

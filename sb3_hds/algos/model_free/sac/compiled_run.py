@@ -1,9 +1,8 @@
 """
-Learning in one compiled program: the twin of the environment, the replay buffer and the updates,
-with several seeds side by side.
+The compiled program of ``learn_compiled``: steps of the twin, replay buffer and updates.
 
-SB3 steps an environment in Python and hands batches over to JAX. Where the environment has a twin,
-nothing needs to leave the program, and seeds are one more axis of every array (``vmap``).
+SB3 steps an environment in Python and passes batches to JAX. With a twin, everything stays in the
+program, and seeds are one more axis of every array (``vmap``).
 """
 
 import dataclasses
@@ -14,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from sb3_hds.algos.model_free.sac.networks import ExploringActor, noise_std
 from sb3_hds.algos.model_free.sac.update import (
     Hyperparams,
     SACState,
@@ -23,7 +23,6 @@ from sb3_hds.algos.model_free.sac.update import (
     update_once,
 )
 from sb3_hds.algos.model_free.update import Batch, zero_metrics
-from sb3_hds.algos.nets.heads import ExploringActor, noise_std
 from sb3_hds.algos.nets.observations import RunningStats, normalize
 from sb3_hds.core import Params, State, Twin
 
@@ -31,15 +30,15 @@ from sb3_hds.core import Params, State, Twin
 @dataclasses.dataclass(frozen=True)
 class Loop:
     """
-    What does not change while a program runs. Static: equal loops share compiled programs.
+    Static configuration of the program; equal loops share compiled programs.
 
     :param limit: steps after which an episode is truncated
-    :param capacity: transitions that are kept
+    :param capacity: of the replay buffer [transitions]
     :param learning_starts: steps with random actions before learning starts
-    :param train_freq: steps in a round
-    :param gradient_steps: updates after them
-    :param sde_sample_freq: steps after which gSDE's noise matrix is drawn again; -1: once a round
-    :param warm: whether gSDE acts before learning starts, too
+    :param train_freq: steps per round
+    :param gradient_steps: updates per round, after its steps
+    :param sde_sample_freq: steps between two draws of gSDE's noise matrix; -1: once per round
+    :param warm: whether gSDE also acts before learning starts
     """
 
     twin: Twin
@@ -61,11 +60,11 @@ class Loop:
 
 class Run(NamedTuple):
     """
-    One seed, on its way.
+    State of the training with one seed.
 
-    :param elapsed: steps since the episode began
-    :param memory: the replay buffer; with a leading axis of ``capacity``
-    :param matrix: of gSDE's noise; empty without
+    :param elapsed: steps since the start of the episode
+    :param memory: the replay buffer, with a leading axis of ``capacity``
+    :param matrix: gSDE's noise matrix; empty without gSDE
     :param total: return of the episode so far
     """
 
@@ -81,8 +80,10 @@ class Run(NamedTuple):
 
 class Step(NamedTuple):
     """
-    :param ended: whether an episode did
-    :param total: its return
+    What is recorded of a step.
+
+    :param ended: whether an episode ended
+    :param total: return of the episode so far
     """
 
     ended: Bool[Array, ""]
@@ -91,20 +92,22 @@ class Step(NamedTuple):
 
 class Round(NamedTuple):
     """
-    :param steps: steps of the environment before it
-    :param happens: False fills up a call of the program, so that all calls are of one length
-    :param hyper: in it
+    Steps of the environment, then updates.
+
+    :param steps: steps of the environment before the round
+    :param active: False for padding, which makes all calls of the program equally long
+    :param hyper: hyperparameters of the round
     """
 
     steps: Int[Array, ""]
-    happens: Bool[Array, ""]
+    active: Bool[Array, ""]
     hyper: Hyperparams
 
 
 def init_run(loop: Loop, params: Params, agent: SACState, key: PRNGKeyArray) -> Run:
     """
-    :param agent: fresh networks
-    :return: a run that stands at the start of its first episode, with nothing remembered
+    :param agent: initial networks
+    :return: a run at the start of its first episode, with an empty replay buffer
     """
     key, start_key = jax.random.split(key)
     state = loop.twin.initial(start_key, params)
@@ -129,10 +132,10 @@ def run_rounds(
     loop: Loop, params: Params, runs: Run, rounds: Round
 ) -> tuple[Run, Step, UpdateMetrics]:
     """
-    :param runs: leading axis: seeds, everywhere but in the number of updates, which they share
-    :param rounds: leading axis: one after the other
-    :return: the runs after them; what each step was, axes seeds, rounds, ``train_freq``; the
-        metrics of the last update of each
+    :param runs: with a leading axis of seeds, except for the shared number of updates
+    :param rounds: with a leading axis of consecutive rounds
+    :return: the runs after the rounds; steps with axes of seeds, rounds and ``train_freq``; metrics
+        of the last update of each seed
     """
     axes = runs_axes()
 
@@ -146,8 +149,8 @@ def run_rounds(
 
 def runs_axes() -> Run:
     """
-    :return: where the axis of the seeds is. The number of updates has none: were it one for each
-        seed, the actor would be updated every time, for those seeds whose turn it might be.
+    :return: axis of the seeds in each field. The number of updates has none: with one per seed,
+        ``vmap`` would turn the delayed update of the actor into one that is always computed.
     """
     fields: Any = dict.fromkeys(Run._fields, 0)
     agent: Any = dict.fromkeys(SACState._fields, 0) | {"n_updates": None}
@@ -157,19 +160,19 @@ def runs_axes() -> Run:
 def _round(
     loop: Loop, params: Params, carry: tuple[Run, UpdateMetrics], now: Round
 ) -> tuple[tuple[Run, UpdateMetrics], Step]:
-    def happen() -> tuple[tuple[Run, UpdateMetrics], Step]:
+    def run_round() -> tuple[tuple[Run, UpdateMetrics], Step]:
         run, steps = jax.lax.scan(partial(_step, loop, params, now.steps), carry[0], counts)
         after = now.steps + loop.train_freq
         learn = lambda: _learn(loop, run, now.hyper, carry[1], after)  # noqa: E731
         return jax.lax.cond(after > loop.learning_starts, learn, lambda: (run, carry[1])), steps
 
     counts = jnp.arange(loop.train_freq)
-    nothing = Step(jnp.zeros(loop.train_freq, bool), jnp.zeros(loop.train_freq))
-    return jax.lax.cond(now.happens, happen, lambda: (carry, nothing))
+    padding = Step(jnp.zeros(loop.train_freq, bool), jnp.zeros(loop.train_freq))
+    return jax.lax.cond(now.active, run_round, lambda: (carry, padding))
 
 
 def _step(loop: Loop, params: Params, before: Array, run: Run, count: Array) -> tuple[Run, Step]:
-    """One step of the environment, remembered; where an episode ends, the next one begins."""
+    """Step the twin and store the transition; at the end of an episode, start the next one."""
     twin, t = loop.twin, before + count
     key, act_key, noise_key, start_key = jax.random.split(run.key, 4)
     matrix = _noise_matrix(loop, run, count, t, noise_key)
@@ -187,7 +190,7 @@ def _step(loop: Loop, params: Params, before: Array, run: Run, count: Array) -> 
     memory = jax.tree.map(lambda rows, new: rows.at[at].set(new), run.memory, row)
     agent = run.agent
     if loop.update_config.normalize_observations:
-        agent = agent._replace(obs_stats=_with_one_more(agent.obs_stats, obs))
+        agent = agent._replace(obs_stats=_updated_stats(agent.obs_stats, obs))
     fresh = twin.initial(start_key, params)
     start = fresh, twin.observe(fresh, params)
     state, obs = jax.tree.map(partial(jnp.where, ended), start, (state, obs))
@@ -227,7 +230,7 @@ def _learn(
 def _action(
     loop: Loop, run: Run, matrix: Array, t: Array, key: PRNGKeyArray
 ) -> Float[Array, " act"]:
-    """From -1 to 1: random before learning starts, then as the algorithm explores."""
+    """In [-1, 1]: random before learning starts, then exploratory actions of the policy."""
     config, agent = loop.update_config, run.agent
     random_key, noise_key = jax.random.split(key)
     n_act = len(loop.twin.actuators)
@@ -254,7 +257,7 @@ def _std_of(loop: Loop, agent: SACState) -> Array:
     return noise_std(actor, dict(agent.actor.weights))
 
 
-def _with_one_more(stats: RunningStats, obs: Array) -> RunningStats:
+def _updated_stats(stats: RunningStats, obs: Array) -> RunningStats:
     """Welford's update, in single precision."""
     count = stats.count + 1.0
     away = obs - stats.mean

@@ -1,4 +1,4 @@
-"""CrossQ: batch normalisation in the place of target networks."""
+"""CrossQ: batch normalisation instead of target networks."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -26,14 +26,14 @@ class CrossQPolicyConfig(GaussianPolicyConfig):
         default_factory=lambda: {"pi": (256, 256), "qf": (512, 512)}
     )
     renorm_warmup_steps: int | None = 100_000
-    usual_optimizer = ("adam", {"b1": 0.5})
+    default_optimizer = ("adam", {"b1": 0.5})
 
 
 class CrossQPolicy(GaussianPolicy):
     """
-    Batch normalisation in actor and critics, and Adam's ``b1`` of 0.5 (Bhatt et al., ICLR 2024).
-    Their critics have 2048 units, which two cores are too slow for: ``net_arch={"pi": [256, 256],
-    "qf": [2048, 2048]}``; the default has a quarter of them.
+    Batch normalisation in actor and critics, and Adam with a ``b1`` of 0.5 (Bhatt et al., ICLR
+    2024). The default critics have 512 units per layer, a quarter of the paper's, so that two cores
+    can train them. The paper's: ``net_arch={"pi": [256, 256], "qf": [2048, 2048]}``.
     """
 
     @takes(CrossQPolicyConfig)
@@ -55,18 +55,18 @@ class CrossQConfig(SACConfig):
 
 class CrossQ(SoftActorCritic):
     """
-    Batch normalisation in deep reinforcement learning: one pass of the critics over current and
-    next pairs of state and action, and no target networks.
+    Batch-normalised critics without target networks: one joint forward pass of the critics over
+    current and next pairs of state and action.
 
     Source: Bhatt et al., *CrossQ: Batch Normalization in Deep Reinforcement Learning for Greater
     Sample Efficiency and Simplicity*, ICLR 2024: critics of width 2048
     (``policy_kwargs={"net_arch": {"pi": [256, 256], "qf": [2048, 2048]}}``; here 512, which two
-    cores can train), Adam with b1 = 0.5, learning rate 1e-3, three updates of the critics for each
-    of the actor. Their discount is 0.99, but 0.9999 on Swimmer. Batch normalisation becomes batch
-    renormalisation, in each network after 100,000 updates of its own, as in the authors' code
-    (``policy_kwargs={"renorm_warmup_steps": ...}``). SBX's default width is 1024, and its learning
-    rate never changes; here, schedules act. The loss of the entropy coefficient has the coefficient
-    itself, as in the authors' code, where SBX has its logarithm (``linear_ent_coef=False``).
+    cores can train), Adam with b1 = 0.5, learning rate 1e-3, three updates of the critics per
+    update of the actor, a discount of 0.99 (0.9999 on Swimmer). As in the authors' code, batch
+    normalisation becomes batch renormalisation after 100,000 updates of the network
+    (``policy_kwargs={"renorm_warmup_steps": ...}``), and the loss of the entropy coefficient is
+    linear in the coefficient; in SBX, it is linear in its logarithm (``linear_ent_coef=False``),
+    the default width is 1024, and learning-rate schedules have no effect.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

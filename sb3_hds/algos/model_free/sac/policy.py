@@ -1,4 +1,4 @@
-"""The policies of the SAC family, as SB3 sees them: a Gaussian actor and an ensemble of critics."""
+"""Policies of the SAC family: a Gaussian actor and an ensemble of critics."""
 
 import dataclasses
 import math
@@ -14,24 +14,24 @@ import numpy as np
 
 from sb3_hds.algos.base.config import between, check_count, takes
 from sb3_hds.algos.base.policy import LearningPolicy, PolicyConfig
-from sb3_hds.algos.model_free.sac.objectives import min_q, min_values, squared_error
+from sb3_hds.algos.model_free.sac import networks
 from sb3_hds.algos.model_free.sac.update import (
     UpdateConfig,
-    actor_distribution,
     explore,
+    forward,
     init_state,
+    min_q,
+    min_values,
     q_values,
+    squared_error,
 )
-from sb3_hds.algos.nets.heads import USUAL, Critic, ExploringActor, GaussianActor, noise_std
-from sb3_hds.algos.nets.mlp import ORTHOGONAL, ORTHONORMAL, Mlp, SimbaNet
-from sb3_hds.algos.nets.observations import RunningStats, flattener, normalize, size_of
+from sb3_hds.algos.nets.observations import RunningStats, normalize
 from sb3_hds.algos.nets.options import (
     Activation,
     Optimizer,
     Weights,
     activation,
     optimizer_of,
-    widths,
 )
 from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.deploy.policy_function import PolicyFunction
@@ -45,33 +45,31 @@ class GaussianPolicyConfig(PolicyConfig):
     :param observation_space: Box, Discrete, MultiDiscrete, MultiBinary, or a Dict of these, which
         are flattened, choices one-hot
     :param action_space: a bounded Box of any shape
-    :param net_arch: hidden widths of both, or ``{"pi": [...], "qf": [...]}``
+    :param net_arch: hidden widths of actor and critics, or ``{"pi": [...], "qf": [...]}``
     :param activation_fn: name, JAX function or torch module class
-    :param n_critics: members of the ensemble
-    :param n_quantiles: values of each of them
+    :param n_critics: number of critics
+    :param n_quantiles: values per critic
     :param dropout_rate: of the critics
-    :param layer_norm: in the critics; the networks of SimBa and BRO have it in any case
-    :param renorm_warmup_steps: batch normalisation in actor and critics, which becomes batch
-        renormalisation after this number of updates, and CrossQ's update, without target networks;
+    :param layer_norm: in the critics; the networks of SimBa and BRO always have it
+    :param renorm_warmup_steps: use batch normalisation in actor and critics, which becomes batch
+        renormalisation after this number of updates, and CrossQ's update without target networks;
         None: neither
-    :param batch_norm_momentum: the share of its running statistics that stays at an update, as in
-        SBX; SB3-contrib's ``batch_norm_momentum=0.01`` is 0.99 here
-    :param ortho_init: whether layers start orthogonal, as in JAXRL's SAC, rather than as flax and
-        SBX have it: with a gain of the square root of 2, and of 1 where the deviation is read off;
-        ``"hidden"``: but the last ones. The networks of SimBa and BRO start as in their papers
-    :param use_sde: generalised state-dependent exploration (Raffin et al., CoRL 2021)
-    :param log_std_init: gSDE: where the logarithm of the noise matrix's deviation starts
-    :param full_std: gSDE: one deviation for each feature and control, or for each feature
+    :param batch_norm_momentum: the share of the running statistics that an update keeps, as in SBX;
+        SB3-contrib's ``batch_norm_momentum=0.01`` is 0.99 here
+    :param ortho_init: whether layers start orthogonal, as in JAXRL's SAC, rather than with the
+        initialisers of flax and SBX: with a gain of the square root of 2, of 1 in the layer of
+        ``log_std``; ``"hidden"``: all but the last layers. SimBa and BRO start as in their papers.
+    :param use_sde: generalised state-dependent exploration (gSDE; Raffin et al., CoRL 2021)
+    :param log_std_init: gSDE: initial ``log_std`` of the noise matrix
+    :param full_std: gSDE: one ``log_std`` per feature and action instead of one per feature
     :param use_expln: gSDE: slower growth than the exponential above 0
-    :param clip_mean: gSDE: the mean is clipped to this before tanh; 0: not
+    :param clip_mean: gSDE: limit of the mean before tanh; 0: no limit
     :param normalize_observations: by running mean and variance, inside the policy
-    :param squash_log_std: whether the logarithm of the deviation of actions is squashed into
-        [-10, 2] by tanh, not clipped to [-20, 2], which is not for gSDE; None: only in the policies
-        of SimbaSAC and BRO
-    :param optimizer_class: name or function of optax, with its defaults, or torch class, with those
-        of torch
-    :param optimizer_kwargs: besides the learning rate; torch's ``betas`` and ``alpha`` are
-        understood
+    :param squash_log_std: whether tanh squashes ``log_std`` of the actions into [-10, 2], instead
+        of clipping it to [-20, 2]; not with gSDE; None: only in the policies of SimbaSAC and BRO
+    :param optimizer_class: name or function of optax, with its defaults, or torch class, with
+        torch's defaults
+    :param optimizer_kwargs: besides the learning rate; may contain torch's ``betas`` and ``alpha``
     :param qf_optimizer_kwargs: of the critics, where they differ
     """
 
@@ -94,20 +92,32 @@ class GaussianPolicyConfig(PolicyConfig):
     optimizer_class: str | Callable[..., Any] | None = None
     optimizer_kwargs: Mapping[str, Any] | None = None
     qf_optimizer_kwargs: Mapping[str, Any] | None = None
-    #: the optimiser unless one is given, and its arguments
-    usual_optimizer: ClassVar[tuple[str, Mapping[str, Any]]] = ("adam", {})
-    #: whether the deviation is squashed unless it is said
-    squashes: ClassVar[bool] = False
-    #: arguments that these networks do not use
+    #: default optimiser and its arguments
+    default_optimizer: ClassVar[tuple[str, Mapping[str, Any]]] = ("adam", {})
+    #: default of ``squash_log_std``
+    default_squash_log_std: ClassVar[bool] = False
+    #: arguments that these networks do not have
     unused: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        """:raises ValueError: for arguments out of range, or that these networks do not use"""
+        """:raises ValueError: for arguments out of range, or that these networks do not have"""
         check_count("n_critics", self.n_critics)
         check_count("n_quantiles", self.n_quantiles)
         if self.renorm_warmup_steps is not None:
             check_count("renorm_warmup_steps", self.renorm_warmup_steps, 0)
-        _check_ranges(self)
+        ranges = {
+            "batch_norm_momentum": (0.0, 1.0, "from 0 to 1: the share that an update keeps"),
+            "log_std_init": (-math.inf, math.inf, "a finite number"),
+            "clip_mean": (0.0, math.inf, "a number of at least 0; 0 does not clip"),
+        }
+        for name, (low, high, allowed) in ranges.items():
+            if not between(value := getattr(self, name), low, high):
+                raise ValueError(f"{name} must be {allowed}, got {value!r}.")
+        rate, ortho_init = self.dropout_rate, self.ortho_init
+        if not (between(rate, 0.0, 1.0) and rate < 1.0):
+            raise ValueError(f"dropout_rate must be at least 0 and below 1, got {rate!r}.")
+        if ortho_init not in (True, False, "hidden"):
+            raise ValueError(f"ortho_init must be True, False or 'hidden', got {ortho_init!r}.")
         fields = dataclasses.fields(self)
         given = {field.name for field in fields if getattr(self, field.name) != field.default}
         has_batch_norm = self.renorm_warmup_steps is not None
@@ -122,22 +132,22 @@ class GaussianPolicyConfig(PolicyConfig):
             name for name in ("log_std_init", "full_std", "use_expln", "clip_mean") if name in given
         ]
         if idle and not self.use_sde:
-            warnings.warn(f"{', '.join(idle)} in policy_kwargs say nothing without use_sde=True.")
+            warnings.warn(f"policy_kwargs {', '.join(idle)} have no effect without use_sde=True.")
         if (momentum := self.batch_norm_momentum) < 0.5:
             warnings.warn(
-                f"batch_norm_momentum={momentum} is the share of the running statistics that "
-                "stays at an update, as in SBX. SB3-contrib's is the share of the new: pass "
+                f"batch_norm_momentum={momentum} is the share of the running statistics that an "
+                "update keeps, as in SBX. In SB3-contrib, it is the share of the new ones: pass "
                 f"{1.0 - momentum:g} for its {momentum}."
             )
         if self.use_sde and self.squash_log_std:
             raise ValueError(
-                "policy_kwargs={'squash_log_std': True}: with use_sde=True, the deviation of "
-                "actions is that of a noise matrix, which nothing squashes. Leave out one of them."
+                "policy_kwargs={'squash_log_std': True}: with use_sde=True, the standard deviation "
+                "of actions is that of a noise matrix and not squashed. Leave out one of them."
             )
 
     def optimizers(self) -> tuple[Optimizer, Optimizer]:
         """:return: of the actor and of the critics"""
-        make, usual = self.usual_optimizer
+        make, usual = self.default_optimizer
         if self.optimizer_class is not None:
             make, usual = self.optimizer_class, {}
         own = {**usual, **(self.optimizer_kwargs or {})}
@@ -147,41 +157,34 @@ class GaussianPolicyConfig(PolicyConfig):
 
 class GaussianPolicy(LearningPolicy):
     """
-    ``"MlpPolicy"`` and ``"MultiInputPolicy"``: dense layers; without target entropy or rules of its
-    own, so that every algorithm of the family can use it.
+    ``"MlpPolicy"`` and ``"MultiInputPolicy"``: dense layers, for every algorithm of the family.
     """
 
-    held = ("target", "obs_stats")
+    saved_with_weights = ("target", "obs_stats")
 
     @takes(GaussianPolicyConfig)
     def __init__(self, config: GaussianPolicyConfig) -> None:
         self.construct(config)
 
     def construct(self, config: GaussianPolicyConfig) -> None:
-        """Describe networks and optimisers, which are drawn later."""
-        super().__init__(config.observation_space, config.action_space, squash_output=True)
-        self.config, self.arguments = config, config.arguments()
-        net = config.net_arch
-        self.arguments["net_arch"] = dict(net) if isinstance(net, Mapping) else net
-        self.widths = pi, qf = widths(net, "qf")
+        """Describe networks and optimisers; :meth:`build` initialises them."""
+        super().__init__(config)
+        pi, qf = self.widths
+        self.config, self.use_sde = config, config.use_sde
         self.activation_fn = activation(config.activation_fn)
         self.normalize_observations = bool(config.normalize_observations)
         self.n_critics, self.n_quantiles = config.n_critics, config.n_quantiles
-        self.use_sde = config.use_sde
-        self.n_obs = size_of(config.observation_space)
-        self.n_act = int(np.prod(config.action_space.shape))
-        self.flatten = flattener(config.observation_space)
         body, (of_mean, of_std) = self.actor_body(pi), self.last_layers()
         if config.use_sde:
             gsde = (config.log_std_init, config.full_std, config.use_expln, config.clip_mean)
-            self.actor_network = ExploringActor(body, self.n_act, *gsde, of_mean)
+            self.actor_network = networks.ExploringActor(body, self.n_act, *gsde, of_mean)
         else:
-            asked = config.squash_log_std
-            squash = config.squashes if asked is None else bool(asked)
-            self.actor_network = GaussianActor(body, self.n_act, squash, of_mean, of_std)
-        self.critic_network = Critic(self.critic_body(qf), config.n_quantiles, of_mean)
+            given = config.squash_log_std
+            squash = config.default_squash_log_std if given is None else bool(given)
+            self.actor_network = networks.GaussianActor(body, self.n_act, squash, of_mean, of_std)
+        self.critic_network = networks.Critic(self.critic_body(qf), config.n_quantiles, of_mean)
         self.optimizers = config.optimizers()
-        self.forget_noise()
+        self.discard_noise()
         self._noise = np.random.default_rng(0)
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
@@ -190,22 +193,27 @@ class GaussianPolicy(LearningPolicy):
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
         return self._mlp(net_arch, float(self.config.dropout_rate), self.config.layer_norm)
 
-    def _mlp(self, net_arch: Sequence[int], dropout: float = 0.0, layer_norm: bool = False) -> Mlp:
-        of_batch = self.config.renorm_warmup_steps, self.config.batch_norm_momentum
-        start = bool(self.config.ortho_init)
-        return Mlp(net_arch, self.activation_fn, dropout, layer_norm, *of_batch, start)
+    def _mlp(
+        self, net_arch: Sequence[int], dropout: float = 0.0, layer_norm: bool = False
+    ) -> nn.Module:
+        batch_norm = self.config.renorm_warmup_steps, self.config.batch_norm_momentum
+        orthogonal = bool(self.config.ortho_init)
+        return networks.Mlp(
+            net_arch, self.activation_fn, dropout, layer_norm, *batch_norm, orthogonal
+        )
 
     def last_layers(self) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
-        """:return: where they start: those of means and values, and those of deviations"""
-        usual = self.config.ortho_init in (False, "hidden")
-        return (USUAL, USUAL) if usual else (ORTHOGONAL, ORTHONORMAL)
+        """:return: initialisers of the layers of means and values, and of that of ``log_std``"""
+        if self.config.ortho_init in (False, "hidden"):
+            return networks.LECUN_NORMAL, networks.LECUN_NORMAL
+        return networks.ORTHOGONAL, networks.ORTHONORMAL
 
-    def build_plain(self) -> None:
-        """That of SAC; with batch normalisation, that of CrossQ."""
-        self.build(self.plain_update_config(), 1.0, 0, jax.devices()[0])
+    def build_default(self) -> None:
+        """Initialise networks for SAC's update, or CrossQ's with batch normalisation."""
+        self.build(self.sac_update_config(), 1.0, 0, jax.devices()[0])
 
-    def plain_update_config(self) -> UpdateConfig:
-        """:return: that of SAC with these networks; with batch normalisation, that of CrossQ"""
+    def sac_update_config(self) -> UpdateConfig:
+        """:return: SAC's update with these networks, or CrossQ's with batch normalisation"""
         return UpdateConfig(
             actor=self.actor_network,
             critic=self.critic_network,
@@ -221,10 +229,10 @@ class GaussianPolicy(LearningPolicy):
 
     def build(self, config: UpdateConfig, ent_coef: float, seed: int, device: Any) -> None:
         """
-        Draw fresh networks.
+        Initialise the networks.
 
         :param config: of the algorithm
-        :param ent_coef: where the entropy coefficient starts
+        :param ent_coef: initial entropy coefficient
         """
         self.update_config = config
         key = jax.random.key(seed, impl=GENERATOR)
@@ -233,8 +241,8 @@ class GaussianPolicy(LearningPolicy):
         )
         self._draw_noise_by(seed)
 
-    def observed(self, obs: np.ndarray | dict[str, np.ndarray]) -> None:
-        """Count observations, of one step of every environment, among those seen."""
+    def update_obs_stats(self, obs: np.ndarray | dict[str, np.ndarray]) -> None:
+        """Add observations of one step of every environment to the running statistics."""
         if self.normalize_observations:
             stats = self.agent_state.obs_stats.with_more(self.flatten(obs))
             self.agent_state = self.agent_state._replace(obs_stats=stats)
@@ -247,7 +255,7 @@ class GaussianPolicy(LearningPolicy):
 
     def reset_noise(self, batch_size: int = 1) -> None:
         """
-        Draw a new noise matrix for each environment, where the policy explores by gSDE.
+        Draw a new noise matrix for each environment, if the policy explores by gSDE.
 
         :param batch_size: number of environments
         """
@@ -258,7 +266,8 @@ class GaussianPolicy(LearningPolicy):
 
     def keep_noise(self, batch_size: int, n_steps: int) -> None:
         """
-        Called at every step, noise matrices last ``n_steps`` steps, whatever was drawn in between.
+        To be called at every step: keep noise matrices for ``n_steps`` steps, also if SB3 draws
+        others in between.
 
         :param batch_size: number of environments
         """
@@ -274,20 +283,20 @@ class GaussianPolicy(LearningPolicy):
 
     def _draw_noise_by(self, seed: int) -> None:
         self._noise = np.random.default_rng(seed)
-        self.forget_noise()
+        self.discard_noise()
 
-    def forget_noise(self) -> None:
+    def discard_noise(self) -> None:
         self.matrices: Any = None
         self._lasting, self._age = self.matrices, 0
 
     def get_std(self) -> np.ndarray:
-        """:return: standard deviation of the noise matrix's entries; 0 without gSDE"""
+        """:return: standard deviation of each entry of the noise matrix; 0 without gSDE"""
         if not self.use_sde:
             return np.zeros(1)
-        return np.asarray(noise_std(self.actor_network, self.agent_state.actor.weights))  # type: ignore[arg-type]
+        return np.asarray(networks.noise_std(self.actor_network, self.agent_state.actor.weights))  # type: ignore[arg-type]
 
     def policy_function(self) -> PolicyFunction:
-        """:return: what the policy computes where nothing is explored, to be exported"""
+        """:return: the deterministic policy, to be exported"""
         state, scales = self.agent_state, None
         if self.normalize_observations:
             stats = state.obs_stats
@@ -300,20 +309,20 @@ class GaussianPolicy(LearningPolicy):
         actor, stats = state.actor.weights, state.obs_stats
         if deterministic:
             return np.asarray(_mean(self.actor_network, actor, stats, obs))
-        if not self.use_sde:
+        if self.use_sde:
+            if self.matrices is None:
+                self.reset_noise()
+            matrices: Any = self.matrices
+            noise = matrices if len(matrices) == len(obs) else matrices[:1]
+        else:
             noise = self._noise.standard_normal((len(obs), self.n_act), np.float32)
-            return np.asarray(_scattered(self.update_config, actor, state.extra, stats, obs, noise))
-        if self.matrices is None:
-            self.reset_noise()
-        matrices: Any = self.matrices
-        matrices = matrices if len(matrices) == len(obs) else matrices[:1]
-        return np.asarray(_moved(self.update_config, actor, state.extra, stats, obs, matrices))
+        return np.asarray(_exploratory(self.update_config, actor, state.extra, stats, obs, noise))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SimbaPolicyConfig(GaussianPolicyConfig):
     """
-    Arguments of ``SimbaPolicy``; the optimiser is AdamW with the weight decay of the paper.
+    Arguments of ``SimbaPolicy``; the default optimiser is AdamW with the paper's weight decay.
 
     :param net_arch: a quarter of the paper's width, ``{"pi": [128], "qf": [128, 128]}`` by default
     """
@@ -322,21 +331,20 @@ class SimbaPolicyConfig(GaussianPolicyConfig):
         default_factory=lambda: {"pi": (128,), "qf": (128, 128)}
     )
     normalize_observations: bool = True
-    usual_optimizer = ("adamw", {"weight_decay": 1e-2})
+    default_optimizer = ("adamw", {"weight_decay": 1e-2})
     unused = ("renorm_warmup_steps", "ortho_init")
 
 
 class SimbaPolicy(GaussianPolicy):
     """
     ``"SimbaPolicy"``: residual networks on observations normalised by running statistics (Lee et
-    al., ICLR 2025), with the weight decay of the paper. Its critics have 512 units, which two cores
-    are too slow for: ``net_arch={"pi": [128], "qf": [512, 512]}``; the default has a quarter of
-    them.
+    al., ICLR 2025), with the paper's weight decay. The default critics have 128 units per layer, a
+    quarter of the paper's (``net_arch={"pi": [128], "qf": [512, 512]}``), so that two cores can
+    train them.
 
-    What the algorithm samples from stays that of the algorithm: the logarithm of the deviation of
-    actions is clipped, as in SBX, and starts near 0, which is what the first entropy coefficient of
-    1 and the target entropies of TQC and DroQ are made for. ``squash_log_std=True`` makes it that
-    of SimBa's authors.
+    The action distribution remains the algorithm's: ``log_std`` is clipped, as in SBX, and starts
+    near 0, for which the initial entropy coefficient of 1 and the target entropies of TQC and DroQ
+    are chosen. ``squash_log_std=True`` is the distribution of SimBa's authors.
     """
 
     narrow = 128
@@ -346,33 +354,17 @@ class SimbaPolicy(GaussianPolicy):
         self.construct(config)
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
-        return SimbaNet(net_arch, self.activation_fn)
+        return networks.SimbaNet(net_arch, self.activation_fn)
 
     def critic_body(self, net_arch: Sequence[int]) -> nn.Module:
-        return SimbaNet(net_arch, self.activation_fn, float(self.config.dropout_rate))
-
-
-def _check_ranges(config: GaussianPolicyConfig) -> None:
-    ranges = {
-        "batch_norm_momentum": (0.0, 1.0, "from 0 to 1: the share that stays at an update"),
-        "log_std_init": (-math.inf, math.inf, "a finite number"),
-        "clip_mean": (0.0, math.inf, "a number of at least 0; 0 does not clip"),
-    }
-    for name, (low, high, allowed) in ranges.items():
-        if not between(value := getattr(config, name), low, high):
-            raise ValueError(f"{name} must be {allowed}, got {value!r}.")
-    rate = config.dropout_rate
-    if not (between(rate, 0.0, 1.0) and rate < 1.0):
-        raise ValueError(f"dropout_rate must be at least 0 and below 1, got {rate!r}.")
-    if config.ortho_init not in (True, False, "hidden"):
-        raise ValueError(f"ortho_init must be True, False or 'hidden', got {config.ortho_init!r}.")
+        return networks.SimbaNet(net_arch, self.activation_fn, float(self.config.dropout_rate))
 
 
 @partial(jax.jit, static_argnums=0)
 def _q_values(
     config: UpdateConfig, weights: Weights, stats: RunningStats, obs: Any, actions: Any
 ) -> jax.Array:
-    """Dropout, where there is some, is the same in each call."""
+    """Every call draws the same dropout masks."""
     inside = normalize(stats, obs) if config.normalize_observations else obs
     values, _ = q_values(config, weights, inside, actions, jax.random.key(0))
     return jnp.mean(values, -1, keepdims=True)
@@ -380,21 +372,22 @@ def _q_values(
 
 @partial(jax.jit, static_argnums=0)
 def _mean(actor: nn.Module, weights: Weights, stats: RunningStats, obs: Any) -> jax.Array:
-    return jnp.tanh(actor_distribution(actor, weights, normalize(stats, obs))[0].mean)
+    return jnp.tanh(forward(actor, weights, normalize(stats, obs))[0].mean)
 
 
 @partial(jax.jit, static_argnums=0)
-def _scattered(
+def _exploratory(
     config: UpdateConfig, weights: Weights, extra: Any, stats: RunningStats, obs: Any, noise: Any
 ) -> jax.Array:
-    return explore(config, weights, extra, normalize(stats, obs), lambda g: g.std * noise)
+    """
+    :param noise: standard normal, shape ``(batch, act)``; with gSDE a noise matrix for each
+        environment or one for all, shape ``(batch or 1, latent, act)``
+    """
 
+    def deviation(gaussian: networks.Gaussian) -> jax.Array:
+        if noise.ndim == 2:
+            return gaussian.std * noise
+        each = jnp.broadcast_to(noise, (obs.shape[0], *noise.shape[1:]))
+        return jnp.einsum("bl,bla->ba", gaussian.latent, each)
 
-@partial(jax.jit, static_argnums=0)
-def _moved(
-    config: UpdateConfig, weights: Weights, extra: Any, stats: RunningStats, obs: Any, matrices: Any
-) -> jax.Array:
-    """Every environment has its matrix; with one matrix, it is everybody's."""
-    each = jnp.broadcast_to(matrices, (obs.shape[0], *matrices.shape[1:]))
-    noise = lambda g: jnp.einsum("bl,bla->ba", g.latent, each)  # noqa: E731
-    return explore(config, weights, extra, normalize(stats, obs), noise)
+    return explore(config, weights, extra, normalize(stats, obs), deviation)

@@ -9,23 +9,22 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_hds.algos.base.config import Rate, takes
 from sb3_hds.algos.model_free.sac.algorithm import SACConfig, SoftActorCritic
-from sb3_hds.algos.model_free.sac.objectives import mean_q, mean_values
+from sb3_hds.algos.model_free.sac.networks import ORTHONORMAL
 from sb3_hds.algos.model_free.sac.policy import SimbaPolicy, SimbaPolicyConfig
-from sb3_hds.algos.model_free.sac.update import UpdateConfig
-from sb3_hds.algos.nets.mlp import ORTHONORMAL
+from sb3_hds.algos.model_free.sac.update import UpdateConfig, mean_q, mean_values
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SimbaSACPolicyConfig(SimbaPolicyConfig):
-    """Arguments of ``SimbaSACPolicy``, which squashes the deviation unless it explores by gSDE."""
+    """Arguments of ``SimbaSACPolicy``, which squashes ``log_std`` unless it explores by gSDE."""
 
-    squashes = True
+    default_squash_log_std = True
 
 
 class SimbaSACPolicy(SimbaPolicy):
     """
-    The policy of SimbaSAC: also what actions are drawn from is that of SimBa's authors, with
-    ``squash_log_std=True`` where there is no gSDE, and so is where last layers start.
+    The policy of SimbaSAC. The action distribution (``squash_log_std=True`` without gSDE) and the
+    initialisation of last layers are those of SimBa's authors, too.
     """
 
     @takes(SimbaSACPolicyConfig)
@@ -41,7 +40,7 @@ class SimbaSACConfig(SACConfig):
     """
     Arguments of SimbaSAC.
 
-    :param clipped_double_q: whether the minimum of the critics counts, not their mean
+    :param clipped_double_q: whether targets and actor use the minimum of the critics, not the mean
     """
 
     learning_rate: Rate = 4e-4
@@ -58,26 +57,26 @@ class SimbaSACConfig(SACConfig):
 
 class SimbaSAC(SoftActorCritic):
     r"""
-    SAC with SimBa's networks: a running normalisation of observations inside the policy, residual
-    blocks with layer norm, weight decay.
+    SAC with SimBa's networks: observations normalised by running statistics inside the policy,
+    residual blocks with layer norm, weight decay.
 
     Source: Lee et al., *SimBa: Simplicity Bias for Scaling Up Parameters in Deep Reinforcement
     Learning*, ICLR 2025: replay ratio 2, critics of width 512 and learning rate 1e-4
     (``policy_kwargs={"net_arch": {"pi": [128], "qf": [512, 512]}}, learning_rate=1e-4``; here a
-    quarter of that width, which two cores can train, and four times that rate, since a layer's
-    values change the less at an update the fewer units it has), weight decay 1e-2, initial
-    temperature 0.01, target entropy of minus half the number of controls. The least of two critics
-    counts in tasks that end early; their later code takes all of MuJoCo's in Gymnasium for such,
-    HalfCheetah included. In others, the authors have one critic: ``clipped_double_q=False`` with
-    ``policy_kwargs={"n_critics": 1}``; of more, it takes the mean. Their discount, 1 - 5 / T with
-    episodes of T steps, within 0.95 and 0.995, is for ``gamma`` to say.
+    quarter of that width, which two cores can train, and four times that rate, since an update
+    changes the output of a narrower layer less), weight decay 1e-2, initial temperature 0.01,
+    target entropy of minus half the number of actions. The paper uses the minimum of two critics in
+    tasks with early termination, in its later code in all of Gymnasium's MuJoCo tasks, and one
+    critic in others: ``clipped_double_q=False`` with ``policy_kwargs={"n_critics": 1}``; with more
+    critics, that uses their mean. For episodes of T steps, the paper's ``gamma`` is 1 - 5 / T,
+    clipped to [0.95, 0.995].
 
-    As in the authors' code, :math:`\tanh` squashes the logarithm of the deviation of actions into
-    [-10, 2]: actions start with a deviation near :math:`e^{-4}`, where SAC and SBX clip it to [-20,
-    2] and start near 1. With gSDE (``use_sde=True``), the deviation is that of the noise matrix,
-    which is neither. The loss of the entropy coefficient has the coefficient itself, as theirs,
-    where SBX has its logarithm. Critics are updated before the actor, as in SBX and in the other
-    algorithms here; the authors' code updates them last.
+    As in the authors' code, :math:`\tanh` squashes ``log_std`` of the actions into [-10, 2], so
+    that their standard deviation starts near :math:`e^{-4}`; SAC and SBX clip it to [-20, 2] and
+    start near 1. With gSDE (``use_sde=True``), the standard deviation of the noise matrix is
+    neither squashed nor clipped. As in their code, the loss of the entropy coefficient is linear in
+    the coefficient; in SBX, in its logarithm. The critics are updated before the actor, as in SBX
+    and the other algorithms here; the authors' code updates them last.
 
     SBX's variant is ``learning_rate=3e-4, ent_coef="auto", target_entropy=-n_act,
     linear_ent_coef=False, gradient_steps=1`` with ``policy_kwargs={"net_arch": [256, 256],

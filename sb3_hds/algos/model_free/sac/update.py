@@ -1,16 +1,15 @@
 """
 The update of the SAC family, pure and compiled once.
 
-:func:`update` makes several updates; :func:`update_once` is one: regress the critics on soft
-targets, now and then improve the actor and adapt the entropy coefficient, now and then
-Polyak-average the target critics. What differs between two algorithms of the family is an
-:class:`UpdateConfig`.
+:func:`update` makes several updates. :func:`update_once` regresses the critics on soft targets, in
+intervals improves the actor and adapts the entropy coefficient, and in intervals Polyak-averages
+the target critics. Algorithms of the family differ in their :class:`UpdateConfig`.
 """
 
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol
 
 import flax.linen as nn
 import jax
@@ -18,22 +17,25 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from sb3_hds.algos.model_free.sac.objectives import Loss, Targets, Values
+from sb3_hds.algos.model_free.sac.networks import Gaussian, log_probability
 from sb3_hds.algos.model_free.update import Batch, UpdateStep, apply_schedule
-from sb3_hds.algos.nets.heads import Gaussian, log_probability
 from sb3_hds.algos.nets.observations import RunningStats, normalize
 from sb3_hds.algos.nets.options import Optimizer, TrainState, Weights
 from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
+
+Values = Float[Array, "critics batch values"]
+Targets = Float[Array, "batch targets"]
+Loss = Float[Array, ""]
 
 
 class SACState(NamedTuple):
     """
     Everything that an update changes.
 
-    :param target: weights of the target critics; empty where there are none
+    :param target: weights of the target critics; empty if there are none
     :param log_ent_coef: logarithm of the entropy coefficient, shape ``()``
     :param obs_stats: running statistics of the observations
-    :param extra: state of what only one algorithm has
+    :param extra: state of :class:`Extra`; empty without one
     """
 
     actor: TrainState
@@ -47,7 +49,7 @@ class SACState(NamedTuple):
 
 
 class Hyperparams(NamedTuple):
-    """What may change from call to call without compiling again."""
+    """What may change between two calls without recompiling."""
 
     learning_rate: float
     qf_learning_rate: float
@@ -56,7 +58,7 @@ class Hyperparams(NamedTuple):
 
 
 class UpdateMetrics(NamedTuple):
-    """Of the last update; the actor's are those of the last update that included the actor."""
+    """Of the last update; the actor's and the entropy coefficient's of their own last update."""
 
     critic_loss: Loss
     actor_loss: Loss
@@ -64,28 +66,32 @@ class UpdateMetrics(NamedTuple):
     ent_coef_loss: Loss
 
 
+_ADAM = Optimizer(optax.adam)
+
+
 @dataclasses.dataclass(frozen=True)
 class UpdateConfig:
     """
-    What the update of one algorithm is made of. Static: equal configs share compiled programs.
+    Static configuration of an algorithm's update; equal configs share compiled programs.
 
-    :param actor: observation to ``Gaussian``
-    :param critic: observation and action to values; an ensemble shares this one's structure
-    :param n_critics: members of the ensemble
-    :param target_values: next values of all critics to those in the targets
-    :param critic_loss: of all critics' values against the targets
-    :param actor_objective: values of all critics to what the actor maximises, shape ``(batch,)``
+    :param actor: maps an observation to a ``Gaussian``
+    :param critic: maps observation and action to values; the structure of all critics
+    :param n_critics: number of critics
+    :param target_values: maps the next values of all critics to the values in the targets
+    :param critic_loss: loss of the values of all critics for given targets
+    :param actor_objective: maps the values of all critics to what the actor maximises, shape
+        ``(batch,)``
     :param optimizer: of the actor
     :param qf_optimizer: of the critics
-    :param ent_coef_optimizer: of the logarithm of the entropy coefficient; None: Adam
-    :param policy_delay: updates of the critics for each of the actor
-    :param target_update_interval: updates of the critics for each of the target critics
+    :param ent_coef_optimizer: of the logarithm of the entropy coefficient
+    :param policy_delay: updates of the critics per update of the actor
+    :param target_update_interval: updates of the critics per update of the target critics
     :param learns_ent_coef: whether the entropy coefficient is adapted to the target entropy
     :param linear_ent_coef: whether its loss is linear in the coefficient, not in its logarithm
     :param joint_pass: whether current and next values come from one forward pass of the critics,
         without target critics (CrossQ)
-    :param normalize_observations: whether by running statistics (SimBa)
-    :param extra: what else is updated after the actor; None: nothing
+    :param normalize_observations: whether to normalise them by running statistics (SimBa)
+    :param extra: what is updated in addition, after the actor; None: nothing
     """
 
     actor: nn.Module
@@ -96,7 +102,7 @@ class UpdateConfig:
     actor_objective: Callable[[Values], Float[Array, " batch"]]
     optimizer: Optimizer
     qf_optimizer: Optimizer
-    ent_coef_optimizer: Optimizer | None = None
+    ent_coef_optimizer: Optimizer = _ADAM
     policy_delay: int = 1
     target_update_interval: int = 1
     learns_ent_coef: bool = True
@@ -107,17 +113,15 @@ class UpdateConfig:
 
 
 class Extra(Protocol):
-    """Something more that learns (BRO's optimistic actor)."""
+    """An additional part that learns, such as BRO's optimistic actor."""
 
     def init(self, actor: Weights, obs: Array, key: PRNGKeyArray) -> Any:
-        """:return: its state, for fresh networks"""
-        ...
+        """:return: its initial state"""
 
     def update(
         self, config: UpdateConfig, state: SACState, batch: Batch, hyper: Hyperparams, key: Any
     ) -> Any:
         """:return: its state after an update of the actor"""
-        ...
 
     def explore(self, state: Any, obs: Array, gaussian: Gaussian, noise: Array) -> Array:
         """
@@ -132,19 +136,17 @@ class Extra(Protocol):
 def init_state(
     config: UpdateConfig, n_obs: int, n_act: int, ent_coef: float, key: PRNGKeyArray
 ) -> SACState:
-    """:return: fresh networks and optimisers"""
+    """:return: newly initialised networks and optimisers"""
     key, actor_key, critic_key, extra_key = jax.random.split(key, 4)
     obs, action = jnp.zeros((1, n_obs)), jnp.zeros((1, n_act))
     actor = config.actor.init(actor_key, obs)
     init = lambda key: config.critic.init({"params": key, "dropout": key}, obs, action)  # noqa: E731
     critic = jax.vmap(init)(jax.random.split(critic_key, config.n_critics))
-    log_ent_coef = {"params": log_of(ent_coef)}
-    of_ent_coef = config.ent_coef_optimizer or _ADAM
     return SACState(
-        actor=TrainState(actor, config.optimizer.init(actor["params"])),
-        critic=TrainState(critic, config.qf_optimizer.init(critic["params"])),
+        actor=config.optimizer.train_state(actor),
+        critic=config.qf_optimizer.train_state(critic),
         target={} if config.joint_pass else critic,
-        log_ent_coef=TrainState(log_ent_coef, of_ent_coef.init(log_ent_coef["params"])),
+        log_ent_coef=config.ent_coef_optimizer.train_state({"params": log_of(ent_coef)}),
         obs_stats=RunningStats.empty(n_obs),
         extra=config.extra.init(actor, obs, extra_key) if config.extra else {},
         key=key,
@@ -165,10 +167,10 @@ def update(
     metrics: UpdateMetrics,
 ) -> tuple[SACState, UpdateMetrics]:
     """
-    :param batches: with a leading axis of at least ``n`` batches; the rest is not looked at, so
-        that different ``n`` share a compiled program
-    :param n: how many updates, at least 1
-    :param metrics: of the updates before
+    :param batches: with a leading axis of at least ``n`` batches; the rest is ignored, so that
+        different ``n`` share a compiled program
+    :param n: number of updates, at least 1
+    :param metrics: of the previous updates
     """
 
     def one(i: Array, carry: tuple[SACState, UpdateMetrics]) -> tuple[SACState, UpdateMetrics]:
@@ -176,7 +178,7 @@ def update(
         return update_once(config, state, jax.tree.map(lambda x: x[i], batches), hyper, metrics)
 
     before = state, metrics
-    if len(batches.reward) == 1:  # without a loop, whose carry would be copied
+    if len(batches.reward) == 1:  # a loop would copy its carry
         return one(jnp.zeros((), jnp.int32), before)
     return jax.lax.fori_loop(0, n, one, before)
 
@@ -188,22 +190,19 @@ def update_once(
     hyper: Hyperparams,
     metrics: UpdateMetrics,
 ) -> tuple[SACState, UpdateMetrics]:
-    """The critics on one batch; every ``policy_delay`` updates the actor on the same one."""
+    """Update the critics on one batch, every ``policy_delay`` updates the actor on the same one."""
     if config.normalize_observations:
         batch = batch._replace(
             obs=normalize(state.obs_stats, batch.obs),
             next_obs=normalize(state.obs_stats, batch.next_obs),
         )
-    critics = partial(update_critics, config, batch, hyper)
     actor = partial(update_actor, config, batch, hyper)
     steps = [
-        UpdateStep(("critic",), 1, critics),
+        UpdateStep(("critic",), 1, partial(update_critics, config, batch, hyper)),
         UpdateStep(("actor", "log_ent_coef", "extra"), config.policy_delay, actor),
+        UpdateStep(("target",), config.target_update_interval, partial(soft_update, hyper.tau)),
     ]
-    if not config.joint_pass:
-        polyak = partial(soft_update, hyper.tau)
-        steps.append(UpdateStep(("target",), config.target_update_interval, polyak))
-    return apply_schedule(state, metrics, *steps)
+    return apply_schedule(state, metrics, *steps[: 2 if config.joint_pass else 3])
 
 
 def update_critics(
@@ -219,30 +218,25 @@ def update_critics(
     :math:`a' \sim \pi(s')`.
     """
     act_key, key, next_key = jax.random.split(key, 3)
-    gaussian, _ = actor_distribution(config.actor, state.actor.weights, batch.next_obs)
+    gaussian, _ = forward(config.actor, state.actor.weights, batch.next_obs)
     next_action, log_prob = sample(gaussian, act_key)
     bonus = -jnp.exp(state.log_ent_coef.weights["params"]) * log_prob
     reward, discount = batch.reward, batch.discount * (1.0 - batch.terminated)
 
-    def soft_targets(next_values: Values) -> Targets:
-        chosen = config.target_values(next_values) + bonus[:, None]
-        return jax.lax.stop_gradient(reward[:, None] + discount[:, None] * chosen)
-
-    def separate_passes(params: Any) -> tuple[Loss, Weights]:
-        next_values, _ = q_values(config, state.target, batch.next_obs, next_action, next_key)
+    def loss(params: Any) -> tuple[Loss, Weights]:
         weights = {**state.critic.weights, "params": params}
-        values, weights = q_values(config, weights, batch.obs, batch.action, key, train=True)
-        return config.critic_loss(values, soft_targets(next_values)), weights
+        if config.joint_pass:
+            obs = jnp.concatenate([batch.obs, batch.next_obs])
+            action = jnp.concatenate([batch.action, next_action])
+            both, weights = q_values(config, weights, obs, action, key, train=True)
+            values, next_values = jnp.split(both, 2, axis=1)
+        else:
+            next_values, _ = q_values(config, state.target, batch.next_obs, next_action, next_key)
+            values, weights = q_values(config, weights, batch.obs, batch.action, key, train=True)
+        soft = config.target_values(next_values) + bonus[:, None]
+        targets = jax.lax.stop_gradient(reward[:, None] + discount[:, None] * soft)
+        return config.critic_loss(values, targets), weights
 
-    def joint_pass(params: Any) -> tuple[Loss, Weights]:
-        weights = {**state.critic.weights, "params": params}
-        obs = jnp.concatenate([batch.obs, batch.next_obs])
-        action = jnp.concatenate([batch.action, next_action])
-        both, weights = q_values(config, weights, obs, action, key, train=True)
-        values, next_values = jnp.split(both, 2, axis=1)
-        return config.critic_loss(values, soft_targets(next_values)), weights
-
-    loss = joint_pass if config.joint_pass else separate_passes
     gradient = jax.value_and_grad(loss, has_aux=True)
     (value, weights), slope = gradient(state.critic.weights["params"])
     critic = config.qf_optimizer.apply(
@@ -260,23 +254,23 @@ def update_actor(
     key: PRNGKeyArray,
 ) -> tuple[tuple[TrainState, TrainState, Any], UpdateMetrics]:
     r"""
-    Maximise :math:`Q(s, a) - \alpha \log \pi(a | s)` over the actor, and move the entropy towards
-    its target by the entropy coefficient.
+    Maximise :math:`Q(s, a) - \alpha \log \pi(a | s)` over the actor, and adapt the entropy
+    coefficient :math:`\alpha` to the target entropy.
 
     The loss of the entropy coefficient is :math:`\log\alpha\,(H - \bar{H})`, as in SB3, SBX and
     the authors' code of DroQ and TQC; with ``linear_ent_coef``, it is
     :math:`\alpha\,(H - \bar{H})`, as in equation 18 of Haarnoja et al. Adam cancels the factor
-    between their slopes only where it does not change. Where :math:`\alpha` steadily falls, the
-    latter falls at :math:`\sqrt{1 + k^2} - k` of the speed, with :math:`k` the learning rate in
-    units of 1e-3, as Adam remembers squares for 1000 updates: 0.9, 0.74 and 0.41 at 1e-4, 3e-4 and
-    1e-3.
+    :math:`\alpha` between their slopes only while it is constant. Where :math:`\alpha` falls
+    steadily, the latter falls at :math:`\sqrt{1 + k^2} - k` of the speed, with :math:`k` the
+    learning rate in units of 1e-3, since Adam averages squares over 1000 updates: 0.9, 0.74 and
+    0.41 at 1e-4, 3e-4 and 1e-3.
     """
     act_key, q_key, extra_key = jax.random.split(key, 3)
     ent_coef = jnp.exp(state.log_ent_coef.weights["params"])
 
     def loss(params: Any) -> tuple[Loss, tuple[Array, Weights]]:
         weights = {**state.actor.weights, "params": params}
-        gaussian, weights = actor_distribution(config.actor, weights, batch.obs, train=True)
+        gaussian, weights = forward(config.actor, weights, batch.obs, train=True)
         action, log_prob = sample(gaussian, act_key)
         values, _ = q_values(config, state.critic.weights, batch.obs, action, q_key)
         objective = config.actor_objective(values)
@@ -295,9 +289,8 @@ def update_actor(
         ent_coef_loss=excess * (ent_coef if linear else log_ent_coef.weights["params"]),
     )
     if config.learns_ent_coef:
-        of_ent_coef = config.ent_coef_optimizer or _ADAM
         slope = excess * ent_coef if linear else excess
-        log_ent_coef = of_ent_coef.apply(slope, log_ent_coef, hyper.learning_rate)
+        log_ent_coef = config.ent_coef_optimizer.apply(slope, log_ent_coef, hyper.learning_rate)
     extra = state.extra
     if config.extra is not None:
         now = state._replace(actor=actor, log_ent_coef=log_ent_coef)
@@ -313,17 +306,45 @@ def soft_update(
     return (jax.tree.map(average, state.target, state.critic.weights),), metrics
 
 
+# --- what UpdateConfig chooses from
+
+
+def min_values(values: Values) -> Targets:
+    """Minimum over critics, value by value: clipped double Q-learning (Fujimoto et al. 2018)."""
+    return jnp.min(values, 0)
+
+
+def mean_values(values: Values) -> Targets:
+    """Mean over critics, value by value (BRO)."""
+    return jnp.mean(values, 0)
+
+
+def squared_error(values: Values, targets: Targets) -> Loss:
+    """Half the mean squared error, summed over critics."""
+    return 0.5 * jnp.sum(jnp.mean((values - targets[None]) ** 2, (1, 2)))
+
+
+def min_q(values: Values) -> Float[Array, " batch"]:
+    """Minimum over critics (SAC)."""
+    return jnp.min(jnp.mean(values, -1), 0)
+
+
+def mean_q(values: Values) -> Float[Array, " batch"]:
+    """Mean over critics and quantiles (DroQ, TQC, BRO)."""
+    return jnp.mean(values, (0, 2))
+
+
 # --- forward passes
 
 
-def actor_distribution(
-    actor: nn.Module, weights: Weights, obs: Array, train: bool = False
-) -> tuple[Gaussian, Weights]:
-    """:return: the actor's Gaussian, and its weights with the statistics of this pass"""
+def forward(
+    network: nn.Module, weights: Weights, *inputs: Any, train: bool = False, **rngs: Any
+) -> tuple[Any, Weights]:
+    """:return: what the network computes, and its weights with the batch statistics of this pass"""
     if not train or "statistics" not in weights:
-        return cast(Gaussian, actor.apply(weights, obs, train)), weights
-    gaussian, changed = actor.apply(weights, obs, train, mutable=["statistics"])
-    return cast(Gaussian, gaussian), {**weights, **changed}
+        return network.apply(weights, *inputs, train, **rngs), weights
+    output, changed = network.apply(weights, *inputs, train, **rngs, mutable=["statistics"])
+    return output, {**weights, **changed}
 
 
 def q_values(
@@ -339,29 +360,21 @@ def q_values(
     :return: values of all critics, and their weights with the statistics of this pass
     """
 
-    def one(
-        weights: Weights, key: PRNGKeyArray, obs: Array, action: Array
-    ) -> tuple[Array, Weights]:
-        rngs = {"dropout": key}
-        if not train or "statistics" not in weights:
-            return cast(Array, config.critic.apply(weights, obs, action, train, rngs=rngs)), weights
-        values, changed = config.critic.apply(
-            weights, obs, action, train, rngs=rngs, mutable=["statistics"]
-        )
-        return cast(Array, values), {**weights, **changed}
+    def one(weights: Weights, key: PRNGKeyArray, *inputs: Array) -> tuple[Array, Weights]:
+        return forward(config.critic, weights, *inputs, train=train, rngs={"dropout": key})
 
     keys = jax.random.split(key, config.n_critics)
     if config.n_critics > 1:
-        # Of inputs without an axis of the critics, XLA computes products that it then transposes.
+        # For inputs without an axis of critics, XLA would compute products and transpose them.
         each = lambda x: jnp.broadcast_to(x, (config.n_critics, *x.shape))  # noqa: E731
         return jax.vmap(one)(weights, keys, each(obs), each(action))
-    # One critic, mapped: XLA computes gradients of its kernels transposed, and Adam walks across.
+    # For one critic under vmap, XLA would transpose the gradients of kernels, which slows Adam.
     values, weights = one(jax.tree.map(lambda x: x[0], weights), keys[0], obs, action)
     return values[None], jax.tree.map(lambda x: x[None], weights)
 
 
 def sample(gaussian: Gaussian, key: PRNGKeyArray) -> tuple[Array, Array]:
-    """:return: actions drawn from it, and their log-density"""
+    """:return: actions sampled from the policy, and their log-density"""
     before = gaussian.mean + gaussian.std * jax.random.normal(key, gaussian.mean.shape)
     return jnp.tanh(before), log_probability(gaussian, before)
 
@@ -371,20 +384,17 @@ def explore(
 ) -> Array:
     """
     :param weights: of the actor
-    :param extra: state of what only one algorithm has
+    :param extra: state of ``config.extra``
     :param obs: as the networks see them
     :param noise: maps a Gaussian to deviations from its mean, before tanh
     :return: exploratory actions
     """
-    gaussian, _ = actor_distribution(config.actor, weights, obs)
+    gaussian, _ = forward(config.actor, weights, obs)
     if config.extra is not None:
         return config.extra.explore(extra, obs, gaussian, noise(gaussian))
     return jnp.tanh(gaussian.mean + noise(gaussian))
 
 
 def log_of(ent_coef: Array | float) -> Array:
-    """:return: its logarithm; of 0, that of the least positive number, with no infinity in it"""
+    """:return: its logarithm, finite also for 0: that of the least positive normal number"""
     return jnp.log(jnp.maximum(jnp.asarray(ent_coef, jnp.float32), jnp.finfo(jnp.float32).tiny))
-
-
-_ADAM = Optimizer(optax.adam)

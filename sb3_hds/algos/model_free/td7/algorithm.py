@@ -1,8 +1,6 @@
-"""TD7: learned embeddings, prioritised replay, and policies that are kept once they proved good."""
+"""TD7: learned embeddings, prioritised replay, and checkpoints of assessed policies."""
 
 import dataclasses
-import io
-import pathlib
 from dataclasses import KW_ONLY
 from typing import Any, ClassVar
 
@@ -33,20 +31,20 @@ class TD7Config(ModelFreeConfig):
     :param learning_rate: of encoder, actor and critics; number, schedule or ``"lin_3e-4"``
     :param tau: no effect: target networks are copied
     :param train_freq: steps between two calls of ``train``, or ``(n, "episode")``; None: one
-        episode where policies are assessed, one step where not
-    :param gradient_steps: updates per call of ``train``; no effect where policies are assessed
+        episode with checkpoints, one step without
+    :param gradient_steps: updates per call of ``train``; no effect with checkpoints
     :param target_update_interval: updates between two copies into the target networks
     :param target_policy_noise: standard deviation of the noise on the target policy's actions,
-        which lie in [-1, 1]
-    :param target_noise_clip: its limit
+        which are in [-1, 1]
+    :param target_noise_clip: limit of that noise
     :param exploration_noise: standard deviation of the noise on actions, unless ``action_noise`` is
         passed
-    :param priority_exponent: how much priorities depend on errors; 0: not at all
-    :param use_checkpoints: whether policies are assessed; None: where there is one environment
-    :param max_episodes_per_checkpoint: episodes that assess a policy, after
+    :param priority_exponent: exponent of errors in priorities; 0: uniform
+    :param use_checkpoints: whether policies are assessed; None: with a single environment
+    :param max_episodes_per_checkpoint: episodes per assessment after
         ``updates_before_checkpointing``
-    :param updates_before_checkpointing: up to this number of updates, one episode does
-    :param reset_weight: factor on the best assessment at that moment
+    :param updates_before_checkpointing: updates until which one episode is an assessment
+    :param reset_weight: factor on the best assessment at that point
     :param policy_kwargs: see :class:`~sb3_hds.algos.TD7Policy`
     """
 
@@ -86,25 +84,23 @@ class TD7(ModelFreeAlgorithm):
 
     Source: Fujimoto et al., *For SALE: State-Action Representation Learning for Deep Reinforcement
     Learning*, NeurIPS 2023, with its constants (appendix): target networks are copied every 250
-    updates, noise of 0.1 explores, 25,000 steps are random, priorities are errors to the power of
-    0.4, and 20 episodes assess a policy from 750,000 updates on, one before. Layers start as those
-    of the authors' code, by the defaults of torch: kernels and biases are uniform. Unlike there,
-    noise is added to random actions, too, as SB3 does it.
+    updates, exploration noise is 0.1, the first 25,000 steps are random, the priority exponent is
+    0.4, and an assessment takes 20 episodes after 750,000 updates, one before. Kernels and biases
+    start uniform, as in the authors' code (torch's defaults). Unlike there, noise is added to
+    random actions, too, as in SB3.
 
-    With checkpoints, as in the paper, a policy acts for whole episodes and is assessed by the worst
-    of them, in rewards of the environment itself; only then it is updated, once for each step that
-    it made. That needs one environment, and episodes that end: from one that never does, ``learn``
-    never returns, unless ``use_checkpoints=False``. ``gradient_steps`` is then not looked at; nor,
-    ever, is ``tau``: target networks are copied whole. Resets of the networks
-    (``param_resets``) leave the checkpoint and its assessment as they are. Where a model with a
-    checkpoint goes on learning without assessments, the first update drops it. Without a
-    checkpoint, the policy as it is acts.
-    SBX has no TD7.
+    With checkpoints, as in the paper, a policy acts for whole episodes and is assessed by the
+    lowest of their returns, in unnormalised rewards; only then it is updated, once for each of its
+    steps. That needs a single environment, and episodes that end: if one never does, ``learn``
+    never returns, unless ``use_checkpoints=False``. Checkpoints make ``gradient_steps`` ineffective
+    (``tau`` always is: target networks are copied). ``param_resets`` keep the checkpoint and its
+    assessment. If a model with a checkpoint continues learning without assessments, its first
+    update drops the checkpoint. Without a checkpoint, the current policy acts. SBX has no TD7.
 
-    Prioritised replay draws from SB3's plain buffer. With ``n_steps`` above 1, Dict observations,
-    ``optimize_memory_usage`` or a replay buffer that is passed (``HerReplayBuffer``), transitions
-    are drawn uniformly, and weights in the loss make its expected gradient the same (Fujimoto,
-    Meger and Precup, NeurIPS 2020).
+    Prioritised replay works with SB3's plain buffer. With ``n_steps`` above 1, Dict observations,
+    ``optimize_memory_usage`` or another replay buffer (``HerReplayBuffer``), transitions are drawn
+    uniformly, and weights in the loss give it the same expected gradient (Fujimoto, Meger and
+    Precup, NeurIPS 2020).
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -112,7 +108,7 @@ class TD7(ModelFreeAlgorithm):
         "MultiInputPolicy": TD7Policy,
     }
     policy_family = TD7Policy
-    #: steps of ``learn()`` without a number: twice as many as are random
+    #: twice the number of random steps
     default_timesteps: ClassVar[int] = 50_000
     policy: TD7Policy
     use_checkpoints: bool | None
@@ -135,7 +131,7 @@ class TD7(ModelFreeAlgorithm):
         super().construct(config, **more)
 
     def update_config(self) -> UpdateConfig:
-        """:return: what an update is made of"""
+        """:return: static configuration of the update"""
         config = self.config
         return UpdateConfig(
             **self.policy.parts,
@@ -154,7 +150,7 @@ class TD7(ModelFreeAlgorithm):
 
     @property
     def prioritised(self) -> bool:
-        """Whether transitions are drawn by their errors."""
+        """Whether transitions are drawn in proportion to priorities."""
         return isinstance(self.replay_buffer_class, type) and issubclass(
             self.replay_buffer_class, LapReplayBuffer
         )
@@ -163,12 +159,12 @@ class TD7(ModelFreeAlgorithm):
         super().check_environment(config)
         several = self.n_envs > 1 and config.use_checkpoints
         config.require(not several, "use_checkpoints", "False with several environments")
-        self.warn_of_unused(config, "tau", why="target networks are copied whole")
+        self.warn_of_unused(config, "tau", why="target networks are copied")
         if self.assesses:
             why = "with checkpoints, there are as many updates as steps (use_checkpoints=False)"
             self.warn_of_unused(config, "gradient_steps", why=why)
 
-    def _usual_buffer(self) -> type[ReplayBuffer] | None:
+    def _default_buffer(self) -> type[ReplayBuffer] | None:
         is_dict = isinstance(self.observation_space, spaces.Dict)
         plain = self.n_steps == 1 and not self.optimize_memory_usage and not is_dict
         return LapReplayBuffer if plain else None
@@ -177,13 +173,13 @@ class TD7(ModelFreeAlgorithm):
         self._choose_train_freq()
         super()._setup_model()
         if self.action_noise is None and self.exploration_noise:
-            # SB3 adds it to actions of the space's shape.
-            size = np.full(self.policy.action_shape, self.exploration_noise, np.float32)
+            # SB3 adds noise to actions in the shape of the space.
+            size = np.full(self.action_space.shape or (), self.exploration_noise, np.float32)
             self.action_noise = NormalActionNoise(np.zeros_like(size), size)
             self._derived_noise = self.action_noise
 
     def _choose_train_freq(self) -> None:
-        """What ``load`` was passed counts; what it read, only where it was passed before."""
+        """A ``train_freq`` passed to ``load`` counts; a saved one only if a user had passed it."""
         given: Any = self.train_freq
         if given is not None and not isinstance(given, TrainFreq):
             self._chosen_freq = given
@@ -191,65 +187,46 @@ class TD7(ModelFreeAlgorithm):
             self.train_freq = (1, "episode") if self.assesses else 1  # type: ignore[assignment]
 
     def _excluded_save_params(self) -> list[str]:
-        """The noise that ``exploration_noise`` means is derived from it again."""
+        """Noise that was derived from ``exploration_noise`` is derived again after loading."""
         excluded = [*super()._excluded_save_params(), "_derived_noise"]
-        # With several environments, SB3 has one for each of them.
+        # With several environments, SB3 wraps a noise for each of them.
         noise = getattr(self.action_noise, "base_noise", self.action_noise)
         return excluded if noise is not self._derived_noise else [*excluded, "action_noise"]
 
-    def load_replay_buffer(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        truncate_last_traj: bool = True,
-    ) -> None:
-        """
-        Unpickles, as SB3's does: load what you have saved yourself.
-
-        :param path: of what ``save_replay_buffer`` wrote
-        :param truncate_last_traj: of ``HerReplayBuffer``: as in SB3
-        :raises ValueError: for a buffer without priorities, where transitions are drawn by them;
-            the model then keeps the one that it has
-        """
-        before = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        found = self.replay_buffer
-        if self.prioritised and not isinstance(found, LapReplayBuffer):
-            self.replay_buffer = before
+    def check_replay_buffer(self, buffer: Any, path: Any) -> None:
+        super().check_replay_buffer(buffer, path)
+        if self.prioritised and not isinstance(buffer, LapReplayBuffer):
             raise ValueError(
-                f"'{path}' holds a {type(found).__name__}, which has no priorities to draw by. "
+                f"'{path}' holds a {type(buffer).__name__}, which has no priorities to draw by. "
                 "Load it into TD7(..., replay_buffer_class=ReplayBuffer), which draws uniformly."
             )
 
     def _build(self, seed: int) -> None:
         self.policy.build(self.update_config(), seed, jax_device(self._device_name))
 
-    def _restart(self, seed: int) -> None:
-        """The policy of the last checkpoint goes on acting until a new one does no worse."""
-        before = self.policy.agent_state
-        self._build(seed)
-        kept: dict[str, Any] = {"n_updates": before.n_updates}
-        if before.checkpoint.kept > 0.0:
-            kept["checkpoint"] = before.checkpoint
-        self.policy.agent_state = self.policy.agent_state._replace(**kept)
+    @property
+    def kept_by_restarts(self) -> tuple[str, ...]:
+        """With the checkpoint, which acts until an assessment is at least as good."""
+        return ("n_updates", "checkpoint") if self.policy.has_checkpoint else ("n_updates",)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """
-        Updates, where policies are assessed once for each step that the last one made, and none
-        while it is assessed.
+        Make updates. With checkpoints, there are none during an assessment, then one for each step
+        of the assessed policy.
 
-        :param gradient_steps: how many, where policies are not assessed
-        :param batch_size: transitions in each
-        :raises DivergedError: if one of them diverged; the model keeps its last good state
+        :param gradient_steps: number of updates without checkpoints
+        :param batch_size: transitions per update
+        :raises DivergedError: if an update diverged; the model keeps its last finite state
         """
         if self.assesses:
-            gradient_steps = self._assessed()
+            gradient_steps = self._assess()
         elif gradient_steps > 0:
             self._forget_assessments()
         if gradient_steps > 0:
             super().train(gradient_steps, batch_size)
 
     def _forget_assessments(self) -> None:
-        """What is updated without being assessed has left the checkpoint behind."""
+        """Drop checkpoint and assessments before updates without assessment."""
         if self.policy.has_checkpoint:
             self.policy.drop_checkpoint()
         self._finished, self.best_worst_return = [], -np.inf
@@ -258,7 +235,7 @@ class TD7(ModelFreeAlgorithm):
     def _begin_assessment(self) -> None:
         self.assessed_episodes, self.assessed_steps, self.worst_return = 0, 0, np.inf
 
-    def _assessed(self) -> int:
+    def _assess(self) -> int:
         """
         Assess the policy by its episodes since the last update.
 
@@ -285,18 +262,18 @@ class TD7(ModelFreeAlgorithm):
         return due
 
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
-        """One after the other: what is drawn depends on the errors of the update before."""
+        """One by one, since the errors of an update change the priorities for the next."""
         buffer: Any = self.replay_buffer
         rates, policy = self.learning_rates(), self.policy
         metrics, found = {}, zero_metrics(UpdateMetrics)
         for _ in range(n):
-            batch, drawn = self._drawn(batch_size)
+            batch, drawn = self._sample_batch(batch_size)
             state, found, priorities = update(
                 policy.update_config, policy.agent_state, batch, *rates, found
             )
-            found = jax.device_get(found)  # as before the first update, or it is compiled twice
+            found = jax.device_get(found)  # NumPy, as before the first update: compiles once
             metrics = {name: float(value) for name, value in found._asdict().items()}
-            self._take(state, metrics)
+            self._accept(state, metrics)
             if drawn is None:
                 continue
             buffer.set_priorities(*drawn, np.asarray(priorities))
@@ -304,8 +281,8 @@ class TD7(ModelFreeAlgorithm):
                 buffer.forget_highest()
         return metrics
 
-    def _drawn(self, batch_size: int) -> tuple[Batch, tuple[np.ndarray, np.ndarray] | None]:
-        """:return: a batch, and which transitions it is made of, where these have priorities"""
+    def _sample_batch(self, batch_size: int) -> tuple[Batch, tuple[np.ndarray, np.ndarray] | None]:
+        """:return: a batch, and with priorities the indices of its transitions"""
         if not self.prioritised:
             return Batch(
                 *(rows[0] for rows in batches_of(self.replay_source, 1, batch_size, 1))
@@ -320,12 +297,12 @@ class TD7(ModelFreeAlgorithm):
         if not self.assesses:
             return
         normalizer = self.get_vec_normalize_env()
-        # The scale of normalised rewards drifts, and an assessment may be compared much later.
+        # Assessments far apart are compared, and the scale of normalised rewards drifts.
         earned = reward if normalizer is None else normalizer.get_original_reward()
         self._episode_return += float(earned[0])
         self._episode_length += 1
         if dones[0]:
-            # What random actions earned says nothing of a policy.
+            # Episodes with random actions do not assess the policy.
             if self.num_timesteps - self._episode_length >= self.learning_starts:
                 self._finished.append((self._episode_return, self._episode_length))
             self._begin_episode()

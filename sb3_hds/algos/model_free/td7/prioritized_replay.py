@@ -9,9 +9,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 class SumTree:
     """
-    Numbers, of which one is drawn in proportion to its size in ``log(n)``.
+    A binary tree of sums: sample an entry in proportion to its value in ``log(n)`` steps.
 
-    :param n: how many; all are 0 at first
+    :param n: number of entries, which start at 0
     """
 
     def __init__(self, n: int) -> None:
@@ -24,7 +24,7 @@ class SumTree:
 
     def set(self, index: np.ndarray, values: np.ndarray | float) -> None:
         """
-        :param index: which, shape ``(n,)``
+        :param index: of the entries, shape ``(n,)``
         :param values: at least 0
         """
         node = np.asarray(index) + (1 << self._depth)
@@ -36,20 +36,20 @@ class SumTree:
     def draw(self, at: np.ndarray) -> np.ndarray:
         """
         :param at: numbers from 0 to ``total``, shape ``(n,)``
-        :return: which entry is there, where entries lie one after the other
+        :return: index of the entry at each number in the cumulative sum
         """
         node, at = np.ones(len(at), np.int64), np.array(at)
         for _ in range(self._depth):
             node = 2 * node
             left = self._sums[node]
-            # Rounding may lead beyond the last entry, into empty ones.
+            # With rounding, a number may exceed the sum of all entries: never go to an empty one.
             right = (at >= left) & (self._sums[node + 1] > 0.0)
             at = np.where(right, at - left, at)
             node = node + right
         return node - (1 << self._depth)
 
     def entries(self) -> np.ndarray:
-        """:return: all, shape ``(m,)``, where ``m`` is a power of 2; those beyond ``n`` are 0"""
+        """:return: all entries, shape ``(m,)`` with ``m`` a power of 2; 0 beyond ``n``"""
         return self._sums[1 << self._depth :].copy()
 
     def largest(self) -> float:
@@ -58,8 +58,8 @@ class SumTree:
 
 class LapReplayBuffer(ReplayBuffer):
     r"""
-    Transitions that are drawn in proportion to :math:`\max(|\delta|, 1)^\alpha`; new ones as if
-    their error were the largest so far.
+    Loss-adjusted prioritised replay (LAP): transitions are sampled in proportion to
+    :math:`\max(|\delta|, 1)^\alpha`, new ones with the highest priority so far.
 
     Source: Fujimoto, Meger and Precup, *An Equivalence between Loss Functions and Non-Uniform
     Sampling in Experience Replay*, NeurIPS 2020.
@@ -94,15 +94,15 @@ class LapReplayBuffer(ReplayBuffer):
         """
         :param steps: rows, as drawn
         :param copies: environments, as drawn
-        :param priorities: of those transitions from now on
+        :param priorities: new priorities of these transitions
         """
         self.priorities.set(steps * self.n_envs + copies, priorities)
         self.highest = max(self.highest, float(priorities.max()))
 
     def forget_highest(self) -> None:
-        """New transitions are as important as the most important one that is left."""
+        """Give new transitions the highest priority in the buffer, not the highest ever."""
         self.highest = self.priorities.largest()
 
 
-# Pickles of a buffer name the public package, which stays where it is.
+# Pickled buffers refer to the public package, whose name does not change.
 SumTree.__module__ = LapReplayBuffer.__module__ = "sb3_hds.algos"

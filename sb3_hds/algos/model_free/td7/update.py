@@ -1,6 +1,5 @@
 """
-The update of TD7, pure: embeddings of states and actions, critics on top of them, targets that are
-copied whole.
+The update of TD7, a pure function: encoder, critics, actor, and copies into the target networks.
 
 Source: Fujimoto et al., *For SALE: State-Action Representation Learning for Deep Reinforcement
 Learning*, NeurIPS 2023.
@@ -23,14 +22,14 @@ from sb3_hds.core.numerics.compilation import QUICK_COMPILATION
 @dataclasses.dataclass(frozen=True)
 class UpdateConfig:
     """
-    What an update is made of.
+    Static configuration of the update.
 
     :param target_update_interval: updates between two copies into the target networks
-    :param policy_delay: updates of the critics for each of the actor
+    :param policy_delay: updates of the critics per update of the actor
     :param target_noise: standard deviation of the noise on the target policy's actions
-    :param noise_clip: its limit
-    :param alpha: how much priorities depend on errors
-    :param uniform: transitions are drawn without regard to priorities, and the loss makes up for it
+    :param noise_clip: limit of that noise
+    :param alpha: exponent of errors in priorities
+    :param uniform: whether transitions are drawn uniformly and weighted in the loss instead
     """
 
     encoder: nn.Module
@@ -48,7 +47,7 @@ class UpdateConfig:
 
 
 class Range(NamedTuple):
-    """Of the values that targets had."""
+    """Range of the values of targets."""
 
     low: Float[Array, ""]
     high: Float[Array, ""]
@@ -56,10 +55,10 @@ class Range(NamedTuple):
 
 class Copies(NamedTuple):
     """
-    Weights that do not move with every update.
+    Weights that change with copies only, not with every update.
 
-    :param encoder: whose embeddings actor and critics take
-    :param target_encoder: whose embeddings target actor and critics take
+    :param encoder: its embeddings are inputs of actor and critics
+    :param target_encoder: its embeddings are inputs of target actor and target critics
     """
 
     encoder: Weights
@@ -70,10 +69,10 @@ class Copies(NamedTuple):
 
 class Checkpoint(NamedTuple):
     """
-    What acts where nothing is explored.
+    The policy that provides deterministic actions.
 
-    :param kept: 1: there is one; 0: its weights mean nothing. A number, as all that SB3 hands out
-        as parameters.
+    :param kept: 1: there is a checkpoint; 0: its weights are meaningless. A number, since SB3 saves
+        it as a parameter.
     """
 
     encoder: Weights
@@ -85,9 +84,9 @@ class TD7State(NamedTuple):
     """
     Everything that an update changes.
 
-    :param clip: range of values to which next values are clipped
-    :param range: of all targets so far, as in the authors' code, which never resets it;
-        ``clip`` becomes it with each copy
+    :param clip: range to which next values are clipped
+    :param range: range of all targets so far, never reset, as in the authors' code; each copy
+        copies it into ``clip``
     """
 
     encoder: TrainState
@@ -102,7 +101,7 @@ class TD7State(NamedTuple):
 
 
 class UpdateMetrics(NamedTuple):
-    """Of the last update; the actor's of the last one in which it was updated."""
+    """Of the last update; the actor's of its own last update."""
 
     critic_loss: Float[Array, ""]
     actor_loss: Float[Array, ""]
@@ -111,7 +110,7 @@ class UpdateMetrics(NamedTuple):
 
 @partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICK_COMPILATION)
 def init_state(config: UpdateConfig, n_obs: int, n_act: int, key: PRNGKeyArray) -> TD7State:
-    """:return: fresh networks and optimisers"""
+    """:return: newly initialised networks and optimisers"""
     key, encoder_key, actor_key, critic_key = jax.random.split(key, 4)
     obs, action = jnp.zeros((1, n_obs)), jnp.zeros((1, n_act))
     encoder = config.encoder.init(encoder_key, obs, action)
@@ -122,9 +121,9 @@ def init_state(config: UpdateConfig, n_obs: int, n_act: int, key: PRNGKeyArray) 
     zero = jnp.zeros(())
     infinite = jnp.full_like(zero, jnp.inf)
     return TD7State(
-        encoder=TrainState(encoder, config.qf_optimizer.init(encoder["params"])),
-        actor=TrainState(actor, config.optimizer.init(actor["params"])),
-        critic=TrainState(critic, config.qf_optimizer.init(critic["params"])),
+        encoder=config.qf_optimizer.train_state(encoder),
+        actor=config.optimizer.train_state(actor),
+        critic=config.qf_optimizer.train_state(critic),
         copies=Copies(encoder, actor, critic, encoder),
         checkpoint=Checkpoint(encoder, actor, zero),
         clip=Range(zero, zero),
@@ -135,9 +134,9 @@ def init_state(config: UpdateConfig, n_obs: int, n_act: int, key: PRNGKeyArray) 
 
 
 def act(config: UpdateConfig, encoder: Weights, actor: Weights, obs: Array) -> Array:
-    """:return: controls, by these weights"""
-    nothing = jnp.zeros((*obs.shape[:-1], cast(Any, config.actor).n_act))
-    zs, _ = cast(tuple[Array, Array], config.encoder.apply(encoder, obs, nothing))
+    """:return: actions in [-1, 1] with these weights"""
+    no_action = jnp.zeros((*obs.shape[:-1], cast(Any, config.actor).n_act))
+    zs, _ = cast(tuple[Array, Array], config.encoder.apply(encoder, obs, no_action))
     return cast(Array, config.actor.apply(actor, obs, zs))
 
 
@@ -165,7 +164,7 @@ def update(
 ) -> tuple[TD7State, UpdateMetrics, Float[Array, " batch"]]:
     """
     :param batch: of one update
-    :return: the state, what happened, and the transitions' priorities
+    :return: the state, the metrics, and new priorities of the transitions
     """
     embedded = embed(config, state.copies.encoder, batch.obs, batch.action)
     critics = partial(_update_critics, config, batch, embedded, qf_learning_rate)
@@ -183,14 +182,14 @@ def update(
 def priorities_of(
     config: UpdateConfig, error: Float[Array, "critics batch"]
 ) -> Float[Array, " batch"]:
-    """:return: of transitions with these absolute errors"""
+    """:return: priorities of transitions with these absolute errors"""
     return jnp.maximum(error.max(0), 1.0) ** config.alpha
 
 
 def loss_of(config: UpdateConfig, error: Float[Array, "critics batch"]) -> Float[Array, ""]:
     """
     :param error: absolute errors
-    :return: LAP's loss; where transitions are drawn uniformly, the one of equal expected gradient
+    :return: LAP's loss; with uniform sampling, the loss with the same expected gradient
 
     Source: Fujimoto, Meger and Precup, *An Equivalence between Loss Functions and Non-Uniform
     Sampling in Experience Replay*, NeurIPS 2020.
@@ -220,7 +219,7 @@ def _update_critics(
     found: _Found,
     key: PRNGKeyArray,
 ) -> tuple[tuple[TrainState, TrainState, Range], _Found]:
-    """Embeddings, and critics by the embeddings and targets of copied networks."""
+    """Regress the encoder, and the critics on targets of the copied networks."""
     copies = state.copies
     encoder, encoder_loss = _update_encoder(config, state.encoder, batch, rate)
     noise = config.target_noise * jax.random.normal(key, batch.action.shape)
@@ -250,7 +249,7 @@ def _update_critics(
 def _update_encoder(
     config: UpdateConfig, encoder: TrainState, batch: Batch, rate: float
 ) -> tuple[TrainState, Array]:
-    """Regress the embedding of state and action on that of the next state."""
+    """Regress the embedding of state and action on the embedding of the next state."""
     wanted, _ = embed(config, encoder.weights, batch.next_obs, batch.action)
 
     def loss(params: Any) -> Array:
@@ -270,7 +269,7 @@ def _update_actor(
     found: _Found,
     _: PRNGKeyArray,
 ) -> tuple[tuple[TrainState], _Found]:
-    """Maximise the mean of the critics over the actor's actions."""
+    """Maximise the mean of the critics over the actor."""
 
     def loss(params: Any) -> Array:
         action = cast(Array, config.actor.apply({"params": params}, batch.obs, zs))
@@ -284,7 +283,7 @@ def _update_actor(
 
 
 def _copy(state: TD7State, found: _Found, _: PRNGKeyArray) -> tuple[tuple[Copies, Range], _Found]:
-    """Copy networks, and the range of targets, into those that the targets use."""
+    """Copy networks and the range of targets into those that compute targets."""
     copies = Copies(
         state.encoder.weights,
         state.actor.weights,

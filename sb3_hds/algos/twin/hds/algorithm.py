@@ -17,27 +17,27 @@ from sb3_hds.algos.base.construct import as_list
 from sb3_hds.algos.twin.algorithm import TwinAlgorithm
 from sb3_hds.algos.twin.config import TwinConfig
 from sb3_hds.algos.twin.hds.correction import (
+    ChangePoint,
     Correction,
     CorrectionConfig,
-    Since,
     correct,
     names_to_estimate,
 )
 from sb3_hds.algos.twin.hds.recorded_steps import RecordedSteps, Source, data_from
-from sb3_hds.algos.twin.model import check_known, missing_effects, nulls_of, required
-from sb3_hds.algos.twin.pretraining import meanwhile, nothing
+from sb3_hds.algos.twin.model import missing_effects, nulls_of, required
+from sb3_hds.algos.twin.pretraining import no_poll, run_in_threads
 from sb3_hds.core import Effect, Params, Trajectories, Twin
 from sb3_hds.core.twin import plant_of
-from sb3_hds.effects import ALL, SignFlip, force_of, reversed_joint
+from sb3_hds.effects import ALL, KNOWN, SignFlip, effect_named, force_of, reversed_joint
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.sysid import Diagnosis, Finding, diagnose
 
-# The learned force is learned again when the data have grown by this factor.
+# Growth factor of the data after which the force is learned again.
 _GROWTH = 2.0
-# Planning epochs after a correction that changes the model noticeably: what was learned in another
-# model is mostly right, and a fifth of the pretraining follows the change.
+# Planning epochs after a correction that changes the model noticeably: a fifth of the pretraining,
+# since most of what was learned in the previous model still holds.
 _REPLAN_EPOCHS = 30
-# Where the model has changed, learning rates go back to this point of their schedule.
+# Remaining progress to which learning-rate schedules return after such a correction.
 _AGAIN_FROM = 0.5
 
 # Arguments of ``sysid.fit_residual``.
@@ -52,32 +52,32 @@ class HDSConfig(TwinConfig):
 
     :param exploration_decay: factor on the noise after each epoch (the HDS project: 0.5 to 0.99)
     :param temperature: of the annealed acceptance of step sizes and plans, in units of the mean
-        gain of the last epoch's plans, times 0.9 after each epoch; 0 always takes the best. The HDS
-        project describes it and does not run it.
-    :param calibrated: parameters of the twin and of attached effects that are estimated: ``"all"``,
-        names, or None
-    :param effects: attached to the twin, so that data can inform them: names from ``effects.ALL``
-        (then at every joint or actuator), or effects
-    :param suspected: names of effects that are estimated, at every joint or actuator, once data
-        show that the twin is not exact, and stay where they explain something; only with
+        gain of the last epoch's plans, times 0.9 after each epoch; 0: always accept the best. The
+        HDS project describes it, but does not run it.
+    :param calibrated: parameters of the twin and of attached effects to estimate: ``"all"``, names,
+        or None
+    :param effects: attached to the twin and estimated: names from ``effects.ALL`` (at every joint
+        or actuator), or effects
+    :param suspected: names of effects that are estimated at every joint or actuator if data show
+        that the twin is not exact, and stay where they lower the error; only with
         ``calibrated="all"``. Simulations rarely contain dry friction and command delays, and
-        neither another parameter nor a learned force replaces them well, see the documentation.
+        neither other parameters nor a learned force replace them well, see the documentation.
     :param residual_kwargs: of the learned force: ``n_members``, ``net_arch``, ``caution``, see
         ``sysid.fit_residual``
-    :param beta: share of rollouts in the model with a learned residual force, where it predicts
-        held-out windows better than the model without; ``"auto"``: in proportion to the
-        improvement, all of them from a quarter on; 0: no force is learned. The HDS project: 0.05.
-    :param refit_freq: blocks of ``train_freq`` from one correction to the next; 0: never
-    :param diagnose_freq: blocks of ``train_freq`` from one diagnosis to the next, which attaches
-        the effects that the data name; 0: never
-    :param pretrain_data: ``Trajectories``, or a file of them, from which the model is corrected
-        before the first plan. The HDS project: random motion.
-    :param first_commands: actions of the first steps of the first episode, in the place of the
-        policy's: such as what a diagnosis asked for next, ``found.next_experiment(...).commands``
-        (of several recordings the first), or a file that its ``save`` wrote as ``.npz``; None: the
-        policy acts from the first step on
-    :param max_saved_steps: how many of the measured steps are saved with the model, the latest;
-        those of ``pretrain_data`` where there is room left; 0: none
+    :param beta: share of rollouts in the model with a learned residual force, if that predicts
+        held-out windows better; ``"auto"``: proportional to the improvement, 1 from a quarter on;
+        0: no force is learned. The HDS project: 0.05.
+    :param refit_freq: blocks of ``train_freq`` between two corrections; 0: no corrections
+    :param diagnose_freq: blocks of ``train_freq`` between two diagnoses, which attach the effects
+        that they find; 0: no diagnoses
+    :param pretrain_data: ``Trajectories``, or a file of them, to correct the model with before the
+        first plan. The HDS project: random motion.
+    :param first_commands: actions of the first steps of the first episode instead of the policy's,
+        such as the experiment that a diagnosis recommends, ``found.next_experiment(...).commands``
+        (the first of several recordings), or a file that its ``save`` wrote as ``.npz``; None: the
+        policy acts from the first step
+    :param max_saved_steps: number of latest measured steps that are saved with the model, then of
+        those of ``pretrain_data``; 0: none
     """
 
     _: KW_ONLY
@@ -109,15 +109,16 @@ class HDS(TwinAlgorithm):
     """
     Hybrid differentiable simulation: PODS in a twin that is corrected by measured data.
 
-    It adds to PODS exploration noise that decays, annealed acceptance of step sizes and plans, and
-    a correction of the model after each block of real steps: parameters of the twin and of effects
-    are estimated jointly, since one can absorb another; a residual force is then learned, anew
-    whenever the data have doubled; and a share ``beta`` of the plans is made in that hybrid.
-    Only what improves predictions of held-out windows is kept; an exact twin stays as it is.
+    It adds to PODS decaying exploration noise, annealed acceptance of step sizes and plans, and a
+    correction of the model after each block of real steps: parameters of the twin and of effects
+    are estimated jointly, since one can absorb another; then a residual force is learned, again
+    whenever the data have doubled; a share ``beta`` of the plans is made in that hybrid model. A
+    correction is accepted only if it improves predictions of held-out windows; an exact twin does
+    not change.
 
     Idea: the HDS course project (ETH Zurich, 2024), from its description. Short horizons with a
     learned terminal value, sample weights and averaging are our own; the documentation measures
-    them.
+    their effect.
     """
 
     config_class = HDSConfig
@@ -127,21 +128,21 @@ class HDS(TwinAlgorithm):
         self.construct(config)
 
     def construct(self, config: HDSConfig, **more: Any) -> None:  # type: ignore[override]
-        # Share of rollouts with the learned force, and the twin's values before any correction.
+        # Share of rollouts with the learned force, and the twin's nominal parameters.
         self.model_beta = 0.0
         self.nominal: dict[str, float] = {}
         self.measured = RecordedSteps(self._source, data_from(config.pretrain_data))
-        asked = data_from(config.first_commands, "first_commands")
-        self._commands_asked = None if asked is None else asked.episode(0)[1].tolist()
-        # Blocks of real steps; real steps at the last correction, and when the force was learned.
+        commands = data_from(config.first_commands, "first_commands")
+        self._first_commands = None if commands is None else commands.episode(0)[1].tolist()
+        # Blocks of real steps; real steps at the last correction, and at the last learned force.
         self._n_blocks, self._refitted_at, self._steps_at_force = 0, 0, 0
-        # Real step and recording since which the system is another one; None: it never changed.
+        # Real step and recording of the last change of the system; None: it never changed.
         self._changed_at: int | None = None
         self._changed_in = 0
-        # Whether ``pretrain_data`` were used; planning epochs that are left after a correction.
+        # Whether ``pretrain_data`` were used; remaining planning epochs after a correction.
         self._saw_earlier = False
         self._replanning = 0
-        # Files hold attributes, and plain data only.
+        # Attributes are saved, so they are plain data.
         several = as_list("effects", config.effects, Effect)
         plain = {
             "effects": [e if isinstance(e, str) else e.to_spec() for e in several],
@@ -169,17 +170,17 @@ class HDS(TwinAlgorithm):
         action_noise: ActionNoise | None = None,
         n_envs: int = 1,
     ) -> tuple[np.ndarray, np.ndarray]:
-        step, asked = self.real_timesteps // n_envs, self._commands_asked or ()
-        if self._episode_num or step >= len(asked):
+        step, commands = self.real_timesteps // n_envs, self._first_commands or ()
+        if self._episode_num or step >= len(commands):
             return super()._sample_action(learning_starts, action_noise, n_envs)
         space: Any = self.action_space
-        action = np.tile(np.array(asked[step], space.dtype), (n_envs, 1))
+        action = np.tile(np.array(commands[step], space.dtype), (n_envs, 1))
         action = np.clip(action, space.low, space.high)
         return action, self.policy.scale_action(action)
 
     def _check_first_commands(self) -> None:
-        given = np.shape(self._commands_asked or ())[1:]
-        # A model that is being loaded has no spaces yet, and nothing to ask for.
+        given = np.shape(self._first_commands or ())[1:]
+        # A model that is being loaded has no spaces yet, and no commands.
         if given and self.env is not None and given != (shape := self.action_space.shape):
             raise TrajectoryError(
                 f"first_commands are actions of shape {given}, and the environment takes {shape}. "
@@ -199,13 +200,13 @@ class HDS(TwinAlgorithm):
 
     def correct_model(self, gradient_steps: int = 0) -> Correction | None:
         """
-        Correct the twin by all measured data; if that changes it noticeably, plan again.
+        Correct the twin with all measured data; if that changes it noticeably, plan again.
 
         :param gradient_steps: regression steps of each of those planning epochs; 0: no epochs
-        :return: the correction; None before anything was measured
+        :return: the correction; None without measured data
         :raises NoTwinError: if the model was loaded without environment and without twin
         """
-        data, n_counted = self.measured.recordings(), self._since_change()
+        data, n_counted = self.measured.recordings(), self._steps_since_change()
         if data is None or self.twin is None:
             return None
         n_steps = data.n_steps if n_counted is None else min(data.n_steps, n_counted)
@@ -217,12 +218,12 @@ class HDS(TwinAlgorithm):
             self.model_beta,
             learn_force=n_steps >= _GROWTH * self._steps_at_force,
             n_new=self.real_timesteps - self._refitted_at,
-            since=None if n_counted is None else Since(n_counted, self._changed_in),
+            change=None if n_counted is None else ChangePoint(n_counted, self._changed_in),
         )
-        found = by_data() if self.poll is nothing else meanwhile([by_data], self.poll)[0]
-        if found.since is not None:
-            self._changed_at = self.real_timesteps - found.since.n_steps
-            self._changed_in, self._steps_at_force = found.since.recording, 0
+        found = by_data() if self.poll is no_poll else run_in_threads([by_data], self.poll)[0]
+        if found.change is not None:
+            self._changed_at = self.real_timesteps - found.change.n_steps
+            self._changed_in, self._steps_at_force = found.change.recording, 0
         self._refitted_at = self.real_timesteps
         if found.residual is not None:
             self._steps_at_force = n_steps
@@ -238,21 +239,21 @@ class HDS(TwinAlgorithm):
         for name, value in intervals.items():
             self.logger.record(name, value, exclude="stdout")
         if found.changed and gradient_steps:
-            for left in range(_REPLAN_EPOCHS, 0, -1):
-                self._replanning = left
+            for remaining in range(_REPLAN_EPOCHS, 0, -1):
+                self._replanning = remaining
                 super().train(gradient_steps, self.batch_size)
             self._replanning = 0
         return found
 
     def diagnose(self, **arguments: Any) -> Diagnosis:
         """
-        What the data measured so far say about the twin as it was before any of them.
+        Diagnose the nominal twin with the data measured so far.
 
-        :param arguments: as of :func:`sb3_hds.diagnose`
-        :raises TrajectoryError: before anything was measured
+        :param arguments: of :func:`sb3_hds.diagnose`
+        :raises TrajectoryError: without measured data
         :raises NoTwinError: if the model was loaded without environment and without twin
         """
-        data = self.measured.trajectories(self._since_change())
+        data = self.measured.trajectories(self._steps_since_change())
         if data is None:
             raise TrajectoryError(
                 "Nothing was measured yet. Let the model learn(...) on the real system first."
@@ -263,15 +264,15 @@ class HDS(TwinAlgorithm):
 
     def extend_model(self, **arguments: Any) -> Diagnosis | None:
         """
-        Diagnose what was measured, and attach the effects that the data name to the twin.
+        Diagnose the measured data, and attach the effects that are found to the twin.
 
-        Parameters that corrections estimate anyway are no findings here. The next correction
-        estimates the new effects with them, and learns the residual force again.
+        Parameters that corrections estimate are nuisance parameters of the diagnosis. The next
+        correction estimates the new effects, too, and learns the residual force again.
 
-        :param arguments: as of :func:`sb3_hds.diagnose`
-        :return: the diagnosis; None before anything was measured
+        :param arguments: of :func:`sb3_hds.diagnose`
+        :return: the diagnosis; None without measured data
         """
-        if self.twin is None or self.measured.trajectories(self._since_change()) is None:
+        if self.twin is None or self.measured.trajectories(self._steps_since_change()) is None:
             return None
         nuisances = names_to_estimate(self.twin, self.config.calibrated)
         own = {"budget": "quick", "progress": False, "calibrate": nuisances} | arguments
@@ -295,17 +296,17 @@ class HDS(TwinAlgorithm):
         return found
 
     def _estimates(self, effect: str) -> bool:
-        """:return: whether the twin has this effect at this place already"""
+        """:return: whether the twin already has this effect at this location"""
         known = required(self.twin, self.twin_spec).parameters
         return any(name.startswith(f"{effect}.") for name in known)
 
-    def _since_change(self) -> int | None:
-        """:return: real steps that count, where the system changed; None if all do"""
+    def _steps_since_change(self) -> int | None:
+        """:return: number of real steps since the last change of the system; None: no change"""
         return None if self._changed_at is None else self.real_timesteps - self._changed_at
 
     @property
     def comparison_due(self) -> bool:
-        """What was better in another model need not be so in this one: before it acts, compare."""
+        """After real steps, the model may have changed: compare policies before one acts."""
         return self.real_timesteps > 0 and not self._replanning
 
     def varied(self, twin: Twin) -> Params:
@@ -327,9 +328,10 @@ class HDS(TwinAlgorithm):
             suspected=config.suspected if config.calibrated == "all" else (),
         )
 
-    def _prepared(self, twin: Twin) -> Twin:
+    def _prepare_twin(self, twin: Twin) -> Twin:
         config = self.config
-        check_known(config.suspected)
+        for name in config.suspected:
+            effect_named(name, KNOWN)  # raises if it is unknown
         missing = missing_effects(twin, config.effects)
         twin = twin.extend(*missing) if missing else twin
         if self.twin_spec is None or not self.nominal:
@@ -338,7 +340,7 @@ class HDS(TwinAlgorithm):
         return twin
 
     def _source(self) -> Source:
-        """The replay buffer, with the step that callbacks have seen and SB3 has not stored yet."""
+        """The replay buffer, with the step that callbacks received and SB3 has not stored yet."""
         dt = None if self.twin is None else self.twin.dt
         buffer, step = getattr(self, "replay_buffer", None), self.unstored_step
         limit = self.config.max_saved_steps
@@ -363,18 +365,18 @@ class HDS(TwinAlgorithm):
         return [*names, "measured"], variables
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "measured", "_commands_asked"]
+        return [*super()._excluded_save_params(), "measured", "_first_commands"]
 
 
 def _native_of(finding: Finding, found: Twin) -> dict[str, float]:
-    """:return: values of the twin's own parameters that stand for the effect, if it has any"""
+    """:return: values of the twin's own parameters that describe the effect, if there are any"""
     place = finding.effect, int(finding.where["index"])
     names = plant_of(found).native_effects.get(place, {}).values()
     return {name: found.values[name] for name in names}
 
 
 def _effects_of(finding: Finding, twin: Twin) -> list[Effect]:
-    """:return: the named effect as the data have it; of a joint the wrong way round, several"""
+    """:return: the effect with its estimated parameters; several for a reversed joint"""
     if finding.effect == SignFlip.name and finding.where["slot"] == "joint":
         return list(reversed_joint(twin, int(finding.where["index"])))
     values = {name: found.estimate for name, found in finding.parameters.items()}

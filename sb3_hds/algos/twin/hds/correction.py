@@ -1,4 +1,4 @@
-"""Correct the twin by what was measured: its parameters with those of effects, then a force."""
+"""Correction of the twin by measured data: parameters of twin and effects, then a learned force."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -10,13 +10,13 @@ from sb3_hds.algos.twin.hds.recorded_steps import last_steps
 from sb3_hds.algos.twin.hds.windows import (
     EXACT,
     FEWEST,
-    Since,
+    ChangePoint,
     Windows,
-    divided,
+    detect_change,
+    hold_out_windows,
     latest_windows,
-    mean_error,
+    rms,
     shares_of,
-    since_change,
     windows_of,
 )
 from sb3_hds.algos.twin.model import missing_effects, nulls_of
@@ -33,36 +33,37 @@ from sb3_hds.sysid.estimation.prediction import (
 )
 from sb3_hds.sysid.estimation.residual_force import Residual, fit_force
 
-# As `EXACT`, for nearly all of the latest single steps, since at rest any twin is exact: how
-# little, which share, of how many.
-_EXACT_STEP, _MOST_STEPS, _N_SINGLE = 1e-4, 0.98, 256
-# Of the solver, in each of its passes: the next correction goes on where this one ends.
+# A twin is exact if this quantile of the errors of this number of latest single steps is below this
+# threshold. The quantile is high, since every twin is exact at rest.
+_EXACT_STEP, _QUANTILE, _N_SINGLE = 1e-4, 0.98, 256
+# Iterations of the solver per pass: the next correction continues from its result.
 _SOLVER_STEPS = 20
-# Plans are made again where the corrected model's error is lower by this share.
+# Relative decrease of the error after which plans are made again.
 _NOTICEABLE = 0.1
-# A calibrated twin needs less proof than a learned force: it has few parameters, and a prior.
+# Relative decrease of the error required of a calibrated twin: less than of a learned force, since
+# it has few parameters and a prior.
 _LEAST_OF_CALIBRATION = 0.02
-# A suspected effect stays where the error would be higher without it by this share.
+# Relative increase of the error without a suspected effect from which on the effect stays.
 _LEAST_OF_SUSPECT = 0.01
-# Where held-out windows are of the same few recordings, values that the prior holds for so
-# improbable are not accepted: a system that dry friction holds fast looks like a heavier one.
+# Probability under the prior below which parameters are rejected if held-out windows are from the
+# same recordings: a system that is stuck in dry friction looks like a heavier one.
 _IMPROBABLE = 1e-3
-# A learned force that lowers the error by this share is planned in exclusively.
+# Relative decrease of the error from which on all plans are made with the learned force.
 _TRUSTED = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
 class CorrectionConfig:
     """
-    What is corrected, and how.
+    Arguments of a correction.
 
-    :param names: parameters that are estimated; empty: none
-    :param nominal: values before any data, by name
+    :param names: parameters to estimate; empty: none
+    :param nominal: nominal values of parameters, by name
     :param residual_kwargs: further arguments of ``sysid.fit_residual``
     :param beta: share of rollouts in the learned model, or ``"auto"``; 0: no force is learned
-    :param seed: of whatever is drawn
-    :param suspected: effects that are estimated with the rest once the twin proves inexact, and
-        stay attached where they explain something
+    :param seed: of random numbers
+    :param suspected: effects that are estimated, too, if the twin is not exact, and stay attached
+        if they lower the error
     """
 
     names: tuple[str, ...]
@@ -77,25 +78,24 @@ class CorrectionConfig:
 class Correction:
     """
     Result of a correction. Errors are root mean squares over held-out windows, in standard
-    deviations of the channels; not a number where there was nothing to compare.
+    deviations of the channels; NaN if there was nothing to compare.
 
-    :param twin: to plan in from now on
+    :param twin: the corrected twin
     :param beta: share of rollouts in the learned model
-    :param changed: whether the model is so different that plans should be made again
-    :param since: what counts from now on, if data from before a change of the system were left out
-    :param attached: nominal values of the parameters of effects that the twin has now and had
-        not before
+    :param changed: whether the model has changed so much that plans should be made again
+    :param change: start of the data that count, if a change of the system was detected
+    :param attached: nominal values of the parameters of newly attached effects
     :param fit: of the parameters, if they were estimated
     :param residual: the learned force, if it was learned
-    :param error_twin: of the twin as it was before any data
-    :param error_calibrated: of the calibrated one
-    :param error_hybrid: of that with the learned force
+    :param error_twin: of the nominal twin
+    :param error_calibrated: of the calibrated twin
+    :param error_hybrid: of the calibrated twin with the learned force
     """
 
     twin: Twin
     beta: float
     changed: bool
-    since: Since | None = None
+    change: ChangePoint | None = None
     attached: Mapping[str, float] = dataclasses.field(default_factory=dict)
     fit: Fit | None = None
     residual: Residual | None = None
@@ -105,10 +105,10 @@ class Correction:
 
     def log(self) -> tuple[dict[str, float], dict[str, float]]:
         """
-        :return: by key, errors that there are and parameters as the twin has them now; and for
-            those that it took over from the fit the ends of their intervals
+        :return: by key, the errors and current parameters; and the limits of the intervals of
+            parameters whose estimates were accepted
         """
-        values: dict[str, float] = {"beta": self.beta, "forgotten": int(self.since is not None)}
+        values: dict[str, float] = {"beta": self.beta, "forgotten": int(self.change is not None)}
         for name in ("error_twin", "error_calibrated", "error_hybrid"):
             error = getattr(self, name)
             if not (np.isnan(error) or (name == "error_calibrated" and self.fit is None)):
@@ -135,50 +135,53 @@ def correct(
     beta: float,
     learn_force: bool,
     n_new: int,
-    since: Since | None = None,
+    change: ChangePoint | None = None,
 ) -> Correction:
     """
-    Estimate parameters, then learn what remains; keep each only if held-out windows say so.
+    Estimate parameters, then learn a residual force; accept each only if it predicts held-out
+    windows better.
 
-    :param twin: as it is now
-    :param data: everything measured, oldest first; ``origin`` numbers the recordings
-    :param config: what is corrected, and how
-    :param beta: as it is now
-    :param learn_force: whether it is time to learn the force again
-    :param n_new: steps that came since the last correction
-    :param since: what counts of the data; None: everything
-    :raises CalibrationError: for data that cannot have been measured on what the twin simulates
+    :param twin: the current twin
+    :param data: all measured data, oldest first; ``origin`` numbers the recordings
+    :param config: arguments
+    :param beta: the current share of rollouts in the learned model
+    :param learn_force: whether to learn the force again
+    :param n_new: number of steps since the last correction
+    :param change: start of the data that count; None: all data count
+    :raises CalibrationError: for data that do not fit the twin
     """
     check_fits(twin, data)
-    recent = data if since is None else last_steps(data, since.n_steps)
-    spread = channel_deviations(recent)
+    recent = data if change is None else last_steps(data, change.n_steps)
+    std = channel_deviations(recent)
     if twin.values == config.nominal:
-        single = single_step_errors(twin, recent, spread, _N_SINGLE)
-        typical = float(np.quantile(single, _MOST_STEPS))
+        single = single_step_errors(twin, recent, std, _N_SINGLE)
+        typical = float(np.quantile(single, _QUANTILE))
         if typical < _EXACT_STEP:
             return Correction(twin, beta, changed=False, error_twin=typical)
     try:
-        windows = windows_of(data, twin, spread, since)
+        windows = windows_of(data, twin, std, change)
     except TrajectoryError:
         return Correction(twin, beta, changed=False)
     nominal = twin.with_parameters(**config.nominal)
-    bare, now = (windows.errors(t) for t in (nominal, twin))
+    nominal_errors, current_errors = (windows.errors(t) for t in (nominal, twin))
     real = windows.counted
     if len(real) < FEWEST:
-        return Correction(twin, beta, changed=False, error_twin=mean_error(bare[real]))
+        return Correction(twin, beta, changed=False, error_twin=rms(nominal_errors[real]))
     latest = latest_windows(windows, n_new)
-    if max(mean_error(bare[real]), mean_error(bare[latest])) < EXACT:
-        changed = gain(bare[real], now[real]) > _NOTICEABLE
-        return Correction(nominal, 0.0, changed=changed, error_twin=mean_error(bare[real]))
-    windows, forgotten = since_change(windows, now, latest, n_new)
-    windows = divided(windows, forgotten or since)
+    if max(rms(nominal_errors[real]), rms(nominal_errors[latest])) < EXACT:
+        changed = gain(nominal_errors[real], current_errors[real]) > _NOTICEABLE
+        return Correction(nominal, 0.0, changed=changed, error_twin=rms(nominal_errors[real]))
+    windows, new_change = detect_change(windows, current_errors, latest, n_new)
+    windows = hold_out_windows(windows, new_change or change)
     real = windows.counted
     if len(real) < FEWEST or not windows.held.any():
         return Correction(
-            twin, beta, changed=False, since=forgotten, error_twin=mean_error(bare[real])
+            twin, beta, changed=False, change=new_change, error_twin=rms(nominal_errors[real])
         )
-    found = _corrected(nominal, twin, config, windows, bare, now, beta, learn_force)
-    return dataclasses.replace(found, since=forgotten)
+    found = _corrected(
+        nominal, twin, config, windows, nominal_errors, current_errors, beta, learn_force
+    )
+    return dataclasses.replace(found, change=new_change)
 
 
 def _corrected(
@@ -186,20 +189,20 @@ def _corrected(
     twin: Twin,
     config: CorrectionConfig,
     windows: Windows,
-    bare: np.ndarray,
-    now: np.ndarray,
+    nominal_errors: np.ndarray,
+    current_errors: np.ndarray,
     beta: float,
     learn_force: bool,
 ) -> Correction:
     """
-    :param nominal: as the twin was before any data
-    :param bare: errors of that
-    :param now: errors of the twin as it is
+    :param nominal: the twin before any data
+    :param nominal_errors: errors of the nominal twin
+    :param current_errors: errors of the current twin
     """
-    nominal, twin, config, added = _with_suspects(nominal, twin, config)
+    nominal, twin, config, added = _add_suspects(nominal, twin, config)
     fit = _calibrated(nominal, twin, windows, config)
-    calibrated, errors = _best(nominal, twin, fit, bare, now, windows)
-    calibrated, errors, added = _cleared(calibrated, errors, added, windows)
+    calibrated, errors = _better_twin(nominal, twin, fit, nominal_errors, current_errors, windows)
+    calibrated, errors, added = _drop_useless_suspects(calibrated, errors, added, windows)
     held = windows.held
     found = Correction(
         calibrated,
@@ -207,23 +210,25 @@ def _corrected(
         changed=False,
         attached=added,
         fit=fit,
-        error_twin=mean_error(bare[held]),
-        error_calibrated=mean_error(errors[held]),
+        error_twin=rms(nominal_errors[held]),
+        error_calibrated=rms(errors[held]),
     )
     if beta > 0.0:
-        now = windows.errors(twin, twin.params)
+        current_errors = windows.errors(twin, twin.params)
     found, errors = _with_residual(found, windows, errors, config, learn_force)
-    return dataclasses.replace(found, changed=gain(errors[held], now[held]) > _NOTICEABLE)
+    return dataclasses.replace(
+        found, changed=gain(errors[held], current_errors[held]) > _NOTICEABLE
+    )
 
 
-def _with_suspects(
+def _add_suspects(
     nominal: Twin, twin: Twin, config: CorrectionConfig
 ) -> tuple[Twin, Twin, CorrectionConfig, dict[str, float]]:
     """
-    Errors that are known already stay valid: new effects change nothing yet.
+    Attach suspected effects with nominal parameters, which leave the errors unchanged.
 
-    :return: both twins with the suspected effects, the config with their parameters, and what is
-        believed of these
+    :return: both twins with the suspected effects, the config with their parameters, and the
+        nominal values of these
     """
     missing = missing_effects(twin, config.suspected)
     if not missing:
@@ -236,27 +241,27 @@ def _with_suspects(
     return nominal, twin, config, added
 
 
-def _cleared(
+def _drop_useless_suspects(
     twin: Twin,
     errors: np.ndarray,
     added: Mapping[str, float],
     windows: Windows,
 ) -> tuple[Twin, np.ndarray, dict[str, float]]:
     """
-    Detach suspected effects that explain nothing, since simulating them costs time; they are
-    estimated again next time.
+    Detach suspected effects that do not lower the error, since they cost simulation time; the next
+    correction estimates them again.
 
     :return: the twin without those effects, its errors, and ``added`` without their parameters
     """
-    left = dict(added)
+    remaining = dict(added)
     for key in dict.fromkeys(name.rpartition(".")[0] for name in added):
         own = {name: null for name, null in added.items() if name.startswith(f"{key}.")}
-        cleared = twin.with_parameters(**own)
-        without = windows.errors(cleared)
+        reduced = twin.with_parameters(**own)
+        without = windows.errors(reduced)
         if gain(errors[windows.held], without[windows.held]) < _LEAST_OF_SUSPECT:
-            twin, errors = cleared.without(key), without
-            left = {name: null for name, null in left.items() if name not in own}
-    return twin, errors, left
+            twin, errors = reduced.without(key), without
+            remaining = {name: null for name, null in remaining.items() if name not in own}
+    return twin, errors, remaining
 
 
 def _calibrated(
@@ -265,46 +270,48 @@ def _calibrated(
     windows: Windows,
     config: CorrectionConfig,
 ) -> Fit | None:
-    """Starting from the current values, with the nominal model as prior."""
+    """:return: the fit, started at the current values, with the nominal model as prior, if any"""
     if not config.names:
         return None
-    believed = np.array([nominal.values[name] for name in config.names])
-    start = twin.with_parameters(**{k: 0.0 for k in shares_of(twin)})
+    prior_values = np.array([nominal.values[name] for name in config.names])
+    start = twin.with_parameters(**dict.fromkeys(shares_of(twin), 0.0))
     try:
         return fit_windows(
             start,
             untied(config.names),
             windows.learned,
             windows.origin,
-            windows.spread,
+            windows.std,
             prior=1.0,
-            believed=believed,
+            believed=prior_values,
             max_steps=_SOLVER_STEPS,
         )
     except CalibrationError:
         return None
 
 
-def _best(
+def _better_twin(
     nominal: Twin,
     twin: Twin,
     fit: Fit | None,
-    bare: np.ndarray,
-    now: np.ndarray,
+    nominal_errors: np.ndarray,
+    current_errors: np.ndarray,
     windows: Windows,
 ) -> tuple[Twin, np.ndarray]:
-    """:return: the calibrated twin if it predicts better, otherwise the twin as it is or was"""
+    """:return: the best of calibrated, current and nominal twin, and its errors"""
     held = windows.held
-    current = (twin, now) if now[held].mean() < bare[held].mean() else (nominal, bare)
+    current = nominal, nominal_errors
+    if current_errors[held].mean() < nominal_errors[held].mean():
+        current = twin, current_errors
     if fit is None or not all(np.isfinite(e.estimate) for e in fit.estimates):
         return current
-    if not windows.of_other_recordings and probability_before(fit, nominal) < _IMPROBABLE:
+    if not windows.held_out_by_recording and probability_before(fit, nominal) < _IMPROBABLE:
         return current
     new = twin.with_parameters(**{e.name: e.estimate for e in fit.estimates})
     errors = windows.errors(new)
     if (
-        gain(errors[held], bare[held]) > _LEAST_OF_CALIBRATION
-        and gain(errors[held], now[held]) >= 0.0
+        gain(errors[held], nominal_errors[held]) > _LEAST_OF_CALIBRATION
+        and gain(errors[held], current_errors[held]) >= 0.0
     ):
         return new, errors
     return current
@@ -317,12 +324,12 @@ def _with_residual(
     config: CorrectionConfig,
     learn_force: bool,
 ) -> tuple[Correction, np.ndarray]:
-    """:return: the correction, and the errors of the model that is planned in"""
+    """:return: the correction, and the errors of the model to plan in"""
     twin, residual, held = found.twin, None, windows.held
-    wanted = config.beta != 0.0 and mean_error(errors[held]) > EXACT
+    wanted = config.beta != 0.0 and rms(errors[held]) > EXACT
     if wanted and learn_force:
-        scale = 0.05 * windows.spread if found.fit is None else found.fit.noise
-        scale = np.maximum(scale, 1e-3 * windows.spread)
+        scale = 0.05 * windows.std if found.fit is None else found.fit.noise
+        scale = np.maximum(scale, 1e-3 * windows.std)
         try:
             residual = fit_force(
                 twin, windows.shots, held, scale, seed=config.seed, **config.residual_kwargs
@@ -333,24 +340,25 @@ def _with_residual(
     key = next(iter(shares_of(hybrid)), None)
     if key is None:
         return found, errors
-    whole = windows.errors(hybrid, {**hybrid.params, key: 1.0})
-    found = dataclasses.replace(found, residual=residual, error_hybrid=mean_error(whole[held]))
-    # Simulating a force that does not help costs time.
+    hybrid_errors = windows.errors(hybrid, {**hybrid.params, key: 1.0})
+    found = dataclasses.replace(found, residual=residual, error_hybrid=rms(hybrid_errors[held]))
+    # A force that does not lower the error only costs simulation time.
     if residual is not None and not (residual.accepted or shares_of(twin)):
         return found, errors
-    helps = is_better(whole[held], errors[held])
+    helps = is_better(hybrid_errors[held], errors[held])
     share = 0.0
     if helps:
-        trust = min(1.0, gain(whole[held], errors[held]) / _TRUSTED)
+        trust = min(1.0, gain(hybrid_errors[held], errors[held]) / _TRUSTED)
         share = trust if config.beta == "auto" else float(config.beta)
     twin = hybrid.with_parameters(**{key: 1.0 if helps else 0.0})
     found = dataclasses.replace(found, twin=twin, beta=share)
-    return found, whole if share > 0.0 else errors
+    return found, hybrid_errors if share > 0.0 else errors
 
 
 def names_to_estimate(twin: Twin, wanted: str | Sequence[str] | None) -> tuple[str, ...]:
     """
     :param wanted: ``"all"``, names of parameters, or None
+    :return: full names of the parameters to estimate
     :raises CalibrationError: for a name that the twin does not have
     """
     if wanted == "all":

@@ -1,4 +1,4 @@
-"""The real steps that a model has seen, and how they travel with it."""
+"""The real steps that a model has recorded, and how they are saved with it."""
 
 import dataclasses
 import json
@@ -19,12 +19,12 @@ _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", 
 
 class Source(NamedTuple):
     """
-    Where measured steps are.
+    The replay buffer with the measured steps.
 
     :param buffer: SB3's replay buffer; None before there is one
-    :param dt: time step of the twin [s]; None while there is no twin
-    :param space: of the actions
-    :param limit: steps that are saved, the latest; 0: none
+    :param dt: time step of the twin [s]; None without a twin
+    :param space: action space
+    :param limit: number of latest steps to save; 0: none
     """
 
     buffer: Any
@@ -35,10 +35,10 @@ class Source(NamedTuple):
 
 class RecordedSteps:
     """
-    The real steps that a model has seen. For SB3, which saves it beside the policy, it is a module
-    with ``state_dict`` and ``load_state_dict``.
+    The real steps that a model has recorded. SB3 saves them beside the policy, as a module with
+    ``state_dict`` and ``load_state_dict``.
 
-    :param source: says where they are now
+    :param source: returns the current source of steps
     :param earlier: data from before this model, for example a file of random motion
     """
 
@@ -49,8 +49,8 @@ class RecordedSteps:
 
     def trajectories(self, latest: int | None = None) -> Trajectories | None:
         """
-        :param latest: number of steps, the latest; None: all
-        :return: everything measured, oldest first; None before anything was
+        :param latest: number of latest steps to return; None: all
+        :return: all measured data, oldest first; None without any
         """
         buffer, dt, space, _ = self._source()
         parts = [] if self.earlier is None else [self.earlier]
@@ -65,8 +65,8 @@ class RecordedSteps:
 
     def recordings(self) -> Trajectories | None:
         """
-        :return: everything measured, oldest first; ``origin`` numbers the recordings from the first
-            there ever was. Those whose beginning is lost are left out where there are others.
+        :return: all measured data, oldest first; ``origin`` numbers the recordings since the first
+            one ever. Recordings whose start was overwritten are left out if there are others.
         """
         parts = [self.earlier] if self.earlier is not None else []
         found = self._numbered()
@@ -82,7 +82,7 @@ class RecordedSteps:
         return 0 if self.earlier is None else int(self.earlier.origin.max()) + 1
 
     def _numbered(self) -> Trajectories | None:
-        """What is in the replay buffer, in the order in which it began."""
+        """:return: the recordings in the replay buffer, sorted by their start"""
         buffer, dt, space, _ = self._source()
         if buffer is None or buffer.size() == 0 or dt is None:
             return None
@@ -91,7 +91,7 @@ class RecordedSteps:
         except TrajectoryError:  # none of the steps is finite
             return None
         numbers = np.array(self._recordings.numbers(buffer, begins))
-        if (numbers < 0).all():  # one that has no end is older than the buffer
+        if (numbers < 0).all():  # a single recording is longer than the buffer
             numbers[:] = self._recordings.latest
         found = Trajectories.from_arrays(obs, actions, dt=dt, conditions="replay buffer")
         found = dataclasses.replace(found, origin=numbers)
@@ -110,18 +110,18 @@ class RecordedSteps:
             for name in _COLUMNS:
                 if hasattr(buffer, name):
                     saved[name] = th.as_tensor(getattr(buffer, name)[order].copy())
-            self._numbered()  # some may not have been looked at yet
+            self._numbered()  # gives new recordings their numbers
             numbers = self._recordings.state_dict(buffer, len(order))
             saved |= {f"recordings.{name}": tensor for name, tensor in numbers.items()}
             limit -= len(order) * buffer.n_envs
         if self.earlier is not None and limit > 0:
-            earlier = _tensors_of(_whole(self.earlier, limit))
+            earlier = _tensors_of(_latest_recordings(self.earlier, limit))
             saved |= {f"earlier.{name}": tensor for name, tensor in earlier.items()}
         return saved
 
     def load_state_dict(self, tensors: dict[str, th.Tensor], strict: bool = True) -> None:
         """
-        Fill the replay buffer with what was saved.
+        Fill the replay buffer with the saved steps.
 
         :raises RuntimeError: if the data do not fit the spaces
         """
@@ -154,7 +154,8 @@ class RecordedSteps:
 def data_from(source: Any, argument: str = "pretrain_data") -> Trajectories | None:
     """
     :param source: trajectories, the path of a file that ``Trajectories.save`` wrote, or None
-    :param argument: for which it is given
+    :param argument: name of the argument, for the message
+    :return: the trajectories, or None
     :raises TrajectoryError: for anything else, or a file that cannot be read
     """
     if source is None or isinstance(source, Trajectories):
@@ -168,29 +169,29 @@ def data_from(source: Any, argument: str = "pretrain_data") -> Trajectories | No
 
 
 def last_steps(data: Trajectories, n_steps: int) -> Trajectories:
-    """The end of the data; the recording in which it begins is cut."""
-    obs, actions, left = [], [], max(n_steps, 1)
+    """:return: the last ``n_steps`` steps of the data; the first recording may be cut"""
+    obs, actions, remaining = [], [], max(n_steps, 1)
     for i in reversed(range(len(data))):
-        seen, taken = data.episode(i)
-        obs.insert(0, seen[-left - 1 :])
-        actions.insert(0, taken[-left:])
-        left -= len(actions[0])
-        if left <= 0:
+        observed, taken = data.episode(i)
+        obs.insert(0, observed[-remaining - 1 :])
+        actions.insert(0, taken[-remaining:])
+        remaining -= len(actions[0])
+        if remaining <= 0:
             break
     first = len(data) - len(obs)
     cut = Trajectories.from_arrays(obs, actions, dt=data.dt, conditions=data.conditions[first:])
     return dataclasses.replace(cut, origin=data.origin[first:])
 
 
-def _whole(data: Trajectories, n_steps: int) -> Trajectories:
-    """The latest whole recordings that together have at most ``n_steps`` steps."""
+def _latest_recordings(data: Trajectories, n_steps: int) -> Trajectories:
+    """:return: the latest complete recordings with at most ``n_steps`` steps in total"""
     after = np.cumsum(data.lengths[::-1])[::-1]
     fit = np.flatnonzero(after <= n_steps)
     return data[fit] if len(fit) else last_steps(data, n_steps)
 
 
 def _counted(data: Trajectories) -> Trajectories:
-    """With recordings numbered 0, 1, ..."""
+    """:return: the data with recordings numbered 0, 1, ..."""
     return dataclasses.replace(data, origin=np.unique(data.origin, return_inverse=True)[1])
 
 
@@ -203,7 +204,7 @@ def _part(tensors: dict[str, th.Tensor], name: str) -> dict[str, th.Tensor]:
 
 
 def _for_copies(columns: dict[str, np.ndarray], n_envs: int) -> dict[str, np.ndarray]:
-    """One copy after the other, shared out among another number of copies."""
+    """:return: the columns of all environments in sequence, divided among ``n_envs``"""
     n_saved = columns["observations"].shape[1]
     if n_saved == n_envs:
         return columns
@@ -240,64 +241,63 @@ def _unpadded(saved: dict[str, th.Tensor]) -> Trajectories:
 
 class Recordings:
     """
-    Counts the recordings that went through a replay buffer.
+    Numbers of the recordings that were added to a replay buffer.
 
-    Whether a window is held out depends on the number of its recording. Counted from the oldest
-    step that is left, recordings would get other numbers whenever old steps are overwritten, or
-    left out of a file, and what was learned from would be held out.
+    Whether a window is held out depends on the number of its recording. Numbers that start at the
+    oldest step in the buffer would change when old steps are overwritten or not saved, and windows
+    that were learned from would be held out.
 
-    :param n_before: recordings that there were before any went through the buffer
+    :param n_before: number of recordings before the first one in the buffer
     """
 
     def __init__(self, n_before: int = 0) -> None:
         self._n_before = n_before
-        #: of each recording, at which step of all environments together it began
+        #: start of each recording, counted in steps of all environments together
         self.starts: list[int] = []
-        #: steps of each environment that had gone through the buffer when it was last looked at,
-        #: and where it stood
+        #: steps of each environment that had been added at the last call of `numbers`, and the
+        #: position of the buffer then
         self._n_steps, self._position = 0, 0
 
-    def look_at(self, buffer: Any) -> None:
-        """To be called at least once while the buffer is filled."""
-        self._n_steps, self._position = self.n_steps(buffer), buffer.pos
-
     def n_steps(self, buffer: Any) -> int:
-        """:return: steps of each environment that went through the buffer, those lost included"""
+        """:return: steps of each environment that were added so far, overwritten ones included"""
         since = (buffer.pos - self._position) % buffer.buffer_size
         return max(self._n_steps + since, buffer.size())
 
     @property
     def latest(self) -> int:
-        """The number that was given last."""
+        """Number of the latest recording."""
         return max(0, self._n_before + len(self.starts) - 1)
 
     def numbers(self, buffer: Any, begins: Sequence[tuple[int, int]]) -> list[int]:
         """
-        :param begins: of each recording, steps since the oldest one in the buffer, and environment
-        :return: its number; -1 for the rest of one whose beginning is lost
+        To be called at least once each time that the buffer is filled.
+
+        :param begins: start of each recording, in steps after the oldest one in the buffer, and its
+            environment
+        :return: number of each recording; -1: its start was overwritten
         """
-        self.look_at(buffer)
+        self._n_steps, self._position = self.n_steps(buffer), buffer.pos
         first = self._n_steps - buffer.size()
         starts = [(first + row) * buffer.n_envs + env for row, env in begins]
-        # In each environment the first one that is left may have begun earlier.
+        # The oldest recording of each environment may have started before the oldest step.
         oldest = {env: min(row for row, e in begins if e == env) for _, env in begins}
         cut = [first > 0 and row == oldest[env] for row, env in begins]
         known = set(self.starts)
-        whole = {s for s, rest in zip(starts, cut, strict=True) if not rest and s not in known}
-        self.starts += sorted(whole)
+        new = {s for s, is_cut in zip(starts, cut, strict=True) if not is_cut and s not in known}
+        self.starts += sorted(new)
         number = {start: self._n_before + i for i, start in enumerate(self.starts)}
         return [number.get(start, -1) for start in starts]
 
     def state_dict(self, buffer: Any, n_kept: int) -> dict[str, th.Tensor]:
-        """:param n_kept: steps of each environment that are saved, the latest"""
+        """:param n_kept: number of latest steps of each environment that are saved"""
         lost = self.n_steps(buffer) - n_kept
         numbers = {"starts": self.starts, "lost": lost, "before": self._n_before}
         return {name: th.as_tensor(value, dtype=th.int64) for name, value in numbers.items()}
 
     def load_state_dict(self, saved: dict[str, th.Tensor], buffer: Any, n_saved: int) -> None:
         """
-        :param buffer: filled with what was saved, or the latest of it
-        :param n_saved: steps of each environment that were saved
+        :param buffer: filled with the saved steps, or the latest of them
+        :param n_saved: number of saved steps of each environment
         """
         self.starts, self._n_before = saved["starts"].tolist(), int(saved["before"])
         self._n_steps, self._position = int(saved["lost"]) + n_saved, buffer.pos
