@@ -7,14 +7,14 @@ from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
 from sb3_hds.cli import measured
-from sb3_hds.cli.settings import names
+from sb3_hds.cli.arguments import names
 
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """:param command: that is to understand them"""
+    """:param command: ``sb3-hds calibrate``"""
     measured.add_arguments(command)
     command.add_argument(
         "--free",
@@ -61,20 +61,18 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--json", help="JSON file to write")
     measured.add_write(command)
+    command.set_defaults(run=run)
 
 
 def run(given: argparse.Namespace) -> None:
     """Audit, estimate, and report: on the screen, as JSON, as a twin."""
-    from sb3_hds.core.trajectories.storage import check_target
     from sb3_hds.data import audit
     from sb3_hds.errors import TrajectoryError
     from sb3_hds.sysid import calibrate
     from sb3_hds.sysid.estimation.calibrate import check_fits
     from sb3_hds.sysid.estimation.parameters import free_names
 
-    for target in filter(None, (given.json, given.write)):
-        check_target(target)
-    measured.check_write(given)
+    measured.check_targets(given)
     twin, data = measured.question(given)
     twin = _extended(twin, names(given.effects))
     tied = {pattern: _spelt_out([pattern], twin) for pattern in names(given.tied)}

@@ -7,14 +7,51 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from sb3_hds.cli import measured
-from sb3_hds.cli.classes import algorithm
-from sb3_hds.cli.settings import names, settings
+from sb3_hds.cli.arguments import names, settings
+from sb3_hds.cli.policies import algorithm
+from sb3_hds.errors import ParameterError
 
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
     from sb3_hds.experiments import PolicyGain
     from sb3_hds.sysid import Diagnosis
     from sb3_hds.sysid.design import NextExperiment
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """:param command: ``sb3-hds diagnose``"""
+    measured.add_arguments(command)
+    command.add_argument(
+        "--calibrate",
+        nargs="*",
+        default=[],
+        help="parameters of which the nominal value is not trusted",
+    )
+    command.add_argument(
+        "--effects", nargs="*", help="candidates; default: all, see 'sb3-hds effects'"
+    )
+    command.add_argument("--budget", choices=("full", "quick"), default="full")
+    command.add_argument("--seed", type=int, default=0)
+    command.add_argument("--report", help="HTML page to write")
+    command.add_argument("--animate", help="MP4 film to write: measured and predicted motion")
+    command.add_argument("--json", help="JSON file to write")
+    measured.add_write(command)
+    design = command.add_argument_group("what to record next", "commands that decide what is open")
+    design.add_argument("--next", metavar="FILE", help="CSV or NPZ file of commands to write")
+    design.add_argument("--limits", metavar="FILE", help="yml file: what the machine may do")
+    design.add_argument("--recordings", type=int, default=1, help="to design; default: 1")
+    design.add_argument("--seconds", type=float, default=10.0, help="of each; default: 10")
+    gain = command.add_argument_group("policy gain", "policies from both twins, on the real system")
+    gain.add_argument("--env", help="id of the real system")
+    gain.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE", help="of it")
+    gain.add_argument("--algo", default="hds", help="id in the zoo; default: hds")
+    gain.add_argument("--policies", type=int, default=5, help="trained in each twin; default: 5")
+    gain.add_argument("--policy-budget", type=int, default=0, help="steps of training in a twin")
+    gain.add_argument("--episodes", type=int, default=20, help="for each policy; default: 20")
+    gain.add_argument(
+        "--hyperparams", nargs="*", default=[], metavar="NAME:VALUE", help="of the algorithm"
+    )
+    command.set_defaults(run=run)
 
 
 def run(given: argparse.Namespace) -> None:
@@ -81,11 +118,7 @@ def _next(given: argparse.Namespace, found: "Diagnosis") -> "NextExperiment | No
 
 def _check_targets(given: argparse.Namespace) -> None:
     """Fail early: check everything that would fail after the diagnosis."""
-    from sb3_hds.core.trajectories.storage import check_target
-
-    for target in filter(None, (given.json, given.write)):
-        check_target(target)
-    measured.check_write(given)
+    measured.check_targets(given)
     if given.animate:
         from sb3_hds.sysid.reporting.film import check_film
 
@@ -100,7 +133,6 @@ def _check_targets(given: argparse.Namespace) -> None:
 
 
 def _check_next(given: argparse.Namespace) -> None:
-    from sb3_hds.errors import ParameterError
     from sb3_hds.sysid.design import Limits
     from sb3_hds.sysid.design.result import check_file
 
@@ -119,7 +151,6 @@ def _policy_question(
     """The comparison of policies, to be run on a diagnosis; its arguments are checked now."""
     import gymnasium
 
-    from sb3_hds.errors import ParameterError
     from sb3_hds.experiments import measure_policy_gain
     from sb3_hds.experiments.policy_gain import check_question
 

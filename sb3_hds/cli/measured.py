@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from sb3_hds.cli.columns import loaded
-from sb3_hds.cli.settings import names, settings
+from sb3_hds.cli.arguments import names, settings
+from sb3_hds.errors import NoTwinError, ParameterError, TrajectoryError
 
 if TYPE_CHECKING:
     from sb3_hds.core import Trajectories, Twin
@@ -17,6 +17,13 @@ if TYPE_CHECKING:
 _SUFFIXES = (".xml", ".mjcf", ".urdf")
 #: settings of ``--set`` that say how the twin is made; all others are parameters
 _OPTIONS = ("dt", "integrator", "observe", "payload", "masses")
+_COLUMNS = """Say what the columns mean in a yml file, --columns map.yml:
+
+    time: NAME                               # or {column: NAME, unit: ms}, or dt: SECONDS
+    obs: [NAME, {column: NAME, unit: deg}]   # in the order of 'sb3-hds twins'
+    actions: [NAME]
+
+'sb3-hds columns FILE' prints what is in a log, and such a map to start from."""
 
 
 def add_arguments(command: argparse.ArgumentParser, *, twin_required: bool = True) -> None:
@@ -71,19 +78,29 @@ def question(given: argparse.Namespace) -> "tuple[Twin, Trajectories]":
 
     :raises ParameterError: for words about a model where there is none
     """
-    from sb3_hds.errors import ParameterError
-
     if given.model is not None:
         return _question_of_model(given)
     for option in ("actuators", "ignore"):
         if getattr(given, option):
             raise ParameterError(f"--{option} is about a model file: name one with --model.")
-    return twin_of(given), data_of(given)
+    return twin_of(given), data_of(given, given.columns)
 
 
-def data_of(given: argparse.Namespace) -> "Trajectories":
-    """The data of ``--data``, read with the map of ``--columns``."""
-    return loaded(given, given.columns)
+def data_of(given: argparse.Namespace, columns: Any) -> "Trajectories":
+    """The data of ``--data``; errors in the map of columns are explained in yml."""
+    from sb3_hds.data import Trajectories
+    from sb3_hds.data.columns import FORM
+    from sb3_hds.data.load import WITHOUT_COLUMNS
+
+    files: str | Sequence[str] = given.data[0] if len(given.data) == 1 else given.data
+    try:
+        return Trajectories.load(files, columns=columns)
+    except TrajectoryError as error:
+        message = str(error)
+        for python in (FORM, WITHOUT_COLUMNS):
+            if python in message:
+                message = message.replace(python, _COLUMNS)
+        raise TrajectoryError(message) from error
 
 
 def twin_of(given: argparse.Namespace) -> "Twin":
@@ -93,7 +110,6 @@ def twin_of(given: argparse.Namespace) -> "Twin":
 
 def twin_called(name: str, values: Mapping[str, Any]) -> "Twin":
     """A module or a file may lie in the current folder."""
-    from sb3_hds.errors import NoTwinError
     from sb3_hds.twins import get
 
     if name.endswith(_SUFFIXES):
@@ -118,7 +134,6 @@ def twin_called(name: str, values: Mapping[str, Any]) -> "Twin":
 def _twin_in(path: str) -> "Twin":
     """The twin in a file that ``--json`` or ``--write`` wrote."""
     from sb3_hds.effects import ALL
-    from sb3_hds.errors import NoTwinError
     from sb3_hds.twins import from_spec
 
     with open(path, encoding="utf-8") as file:
@@ -141,13 +156,20 @@ def add_write(command: argparse.ArgumentParser) -> None:
     )
 
 
-def check_write(given: argparse.Namespace) -> None:
-    """:raises ParameterError: for a model file to write where none was read"""
-    from sb3_hds.errors import ParameterError
+def check_targets(given: argparse.Namespace) -> None:
+    """
+    Fail before the work: check the files of ``--json`` and ``--write``.
 
-    if given.write and given.write.endswith(_SUFFIXES) and given.model is None:
+    :raises ParameterError: for a model file to write where none was read
+    """
+    from sb3_hds.core.trajectories.storage import check_target
+
+    write = getattr(given, "write", None)
+    for target in filter(None, (given.json, write)):
+        check_target(target)
+    if write and write.endswith(_SUFFIXES) and given.model is None:
         raise ParameterError(
-            f"{given.write} would be a corrected model file: name the file with --model. A twin "
+            f"{write} would be a corrected model file: name the file with --model. A twin "
             "without one is written as .json."
         )
 
@@ -169,11 +191,6 @@ def write_json(path: str, plain: Mapping[str, Any]) -> None:
     from sb3_hds.core.trajectories.storage import write_bytes
 
     write_bytes(path, (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())
-
-
-if TYPE_CHECKING:
-    from sb3_hds.core import Trajectories
-    from sb3_hds.twins.mujoco import MechanismTwin
 
 
 def _twin_of_model(
@@ -208,7 +225,7 @@ def _question_of_model(given: argparse.Namespace) -> "tuple[MechanismTwin, Traje
     files = given.data[0] if len(given.data) == 1 else given.data
     named = names_in(files, given.columns)
     if named is None:
-        data = loaded(given, given.columns)
+        data = data_of(given, given.columns)
         return make({"dt": data.dt} | own), data
     observed = [entry.name for entry in named.observed]
     commanded = [entry.name for entry in named.commanded]
@@ -217,7 +234,7 @@ def _question_of_model(given: argparse.Namespace) -> "tuple[MechanismTwin, Traje
     columns = named.chosen(
         map(str, found.obs), (str(name).removesuffix(suffix) for name in found.actions)
     )
-    data = loaded(given, columns)
+    data = data_of(given, columns)
     for sentence in named.guessed:
         print(sentence)
     return make({"dt": data.dt} | observe | own), data
@@ -227,7 +244,6 @@ def _matched(
     make: Any, own: Mapping[str, Any], observed: list[str], commanded: list[str]
 ) -> tuple[dict[str, Any], Any]:
     """Velocities that a log does not have are not observed, unless ``--set`` says so."""
-    from sb3_hds.errors import TrajectoryError
     from sb3_hds.twins.mujoco import match
 
     columns = [*observed, *(f"{name} command" for name in commanded)]

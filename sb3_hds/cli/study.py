@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """:param command: that is to understand them"""
+    """:param command: ``sb3-hds study``"""
     parts = command.add_subparsers(dest="part", required=True, metavar="part")
     for name, told in (
         ("run", "run what is not complete; once more after an interruption"),
@@ -46,6 +46,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
             )
         if name == "report":
             part.add_argument("--html", help="page to write; default: report.html in the folder")
+    command.set_defaults(run=run)
 
 
 def run(given: argparse.Namespace) -> int:

@@ -1,11 +1,11 @@
-"""A parser whose errors are one line, with the nearest known name."""
+"""Command-line arguments: a parser with errors of one line, and the values of options."""
 
 import argparse
 import re
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from sb3_hds.errors import did_you_mean
+from sb3_hds.errors import ParameterError, did_you_mean
 
 _CHOICE = re.compile(r"argument (.*): invalid choice: '?(.*?)'? \(choose from (.*)\)")
 _UNKNOWN = "unrecognized arguments: "
@@ -54,3 +54,35 @@ class Version(argparse.Action):
             found = "0+unknown"
         print(f"{parser.prog} {found}")
         parser.exit()
+
+
+def names(words: Sequence[str]) -> list[str]:
+    """Words that blanks or commas separate."""
+    return [name for word in words for name in word.split(",") if name]
+
+
+def settings(option: str, texts: Sequence[str]) -> dict[str, Any]:
+    """
+    :param option: in whose name an error speaks
+    :param texts: ``NAME:VALUE`` each
+    :return: numbers, truth values and words, by name
+    :raises ParameterError: for another form
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        name, colon, value = text.partition(":")
+        if not (name and colon and value):
+            raise ParameterError(f"{option} takes NAME:VALUE, got '{text}'.")
+        found[name] = _value(value)
+    return found
+
+
+def _value(text: str) -> bool | int | float | str:
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text

@@ -1,4 +1,4 @@
-"""``sb3-hds effects`` and ``sb3-hds twins``: the catalogues."""
+"""``sb3-hds effects`` and ``sb3-hds twins``: the catalogues, and checks of twins."""
 
 import argparse
 import hashlib
@@ -10,6 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_hds.cli.arguments import settings
+from sb3_hds.errors import ParameterError, did_you_mean
+
 if TYPE_CHECKING:
     from sb3_hds.core import Parameter
 
@@ -20,6 +23,14 @@ _OF_A_TWIN = (
 )
 #: the rows that :func:`rows_of_effects` makes, stored: reading the classes imports JAX
 STORED = Path(__file__).with_name("effects.json")
+
+
+def add_effects(command: argparse.ArgumentParser) -> None:
+    """:param command: ``sb3-hds effects``"""
+    command.add_argument(
+        "words", nargs="*", metavar="WORD", help="list only those that mention all of these"
+    )
+    command.set_defaults(run=run_effects)
 
 
 def run_effects(given: argparse.Namespace) -> None:
@@ -76,7 +87,48 @@ def _sized(parameter: "tuple[str, Parameter]") -> str:
     return "on or off" if switch else f"{name} [{known.unit}]"
 
 
-def twins(words: Sequence[str]) -> None:
+def add_twins(command: argparse.ArgumentParser) -> None:
+    """:param command: ``sb3-hds twins``"""
+    command.add_argument(
+        "words",
+        nargs="*",
+        metavar="WORD",
+        help="list only those that mention all of these; or 'check "
+        "NAME', for one of your own 'check module:Name': is it finite, consistent, mechanical?",
+    )
+    command.add_argument(
+        "--set",
+        nargs="*",
+        default=[],
+        metavar="NAME:VALUE",
+        help="parameters and options of the twin that is checked: mass:0.3 observe:q",
+    )
+    command.set_defaults(run=run_twins)
+
+
+def run_twins(given: argparse.Namespace) -> int:
+    """:return: 1 where a check failed, else 0"""
+    if given.words[:1] != ["check"]:
+        if given.set:
+            raise ParameterError(
+                "--set changes the twin that is checked: twins check NAME --set ..."
+            )
+        _list_twins(given.words)
+        return 0
+    if len(given.words) != 2:
+        raise ParameterError(
+            "Name one twin, as in 'sb3-hds twins check Pendulum' or 'sb3-hds twins check "
+            f"my_module:MyTwin', got '{' '.join(given.words)}'."
+        )
+    from sb3_hds.cli.measured import twin_called
+    from sb3_hds.twins import check
+
+    found = check(twin_called(given.words[1], settings("--set", given.set)))
+    print(found)
+    return 0 if found.ok else 1
+
+
+def _list_twins(words: Sequence[str]) -> None:
     """All simulations, or those that have the words, with parameters and options."""
     from sb3_hds.twins import get, names
 
@@ -107,8 +159,6 @@ def _with_words(
 
     :raises ParameterError: if there are none
     """
-    from sb3_hds.errors import ParameterError, did_you_mean
-
     spoken = [_spoken(" ".join(row)) for row in rows]
     found = [
         row
