@@ -30,9 +30,9 @@ _INTERRUPTED = "sb3-hds: interrupted"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
-    :param arguments: as on the command line; default: those of this process
-    :return: 0 on any verdict; 1 for invalid input, with one line on why, or where a twin fails its
-        check; 130 when interrupted
+    :param arguments: of the command line; default: ``sys.argv[1:]``
+    :return: 0 on any verdict; 1 for invalid input, with a message of one line, or if a twin
+        fails its check; 130 when interrupted
     :raises SystemExit: with 2, for an unknown command or option
     """
     if arguments is None:
@@ -45,9 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _stop(*_: Any) -> None:
-    """End at once: an exception gets lost in a callback of JAX, and breaks the import of one."""
+    """Exit at once: JAX callbacks swallow exceptions, and one raised during an import breaks it."""
     for stream in (sys.stdout, sys.stderr):
-        # A progress bar has hidden the cursor.
+        # A progress bar may have hidden the cursor.
         print("\x1b[?25h" if stream.isatty() else "", end="", file=stream, flush=True)
     print(_INTERRUPTED, file=sys.stderr, flush=True)
     os._exit(130)
@@ -59,7 +59,7 @@ def _run(given: argparse.Namespace) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
-            # Meant for programmers.
+            # They address programmers, not users.
             warnings.simplefilter("ignore", DeprecationWarning)
             return given.run(given) or 0
     except BrokenPipeError:
@@ -77,12 +77,12 @@ def _warn(
     file: Any = None,
     line: str | None = None,
 ) -> None:
-    """One line, without the code that warns."""
+    """Print a warning as one line, without the source line that raised it."""
     print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def parser() -> argparse.ArgumentParser:
-    """:return: what the command understands"""
+    """:return: the parser of ``sb3-hds`` and its commands"""
     from sb3_hds.cli import calibrate, catalogue, deployment, diagnose, logs, robustness, study
     from sb3_hds.cli.arguments import Parser, Version
 
@@ -94,19 +94,15 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="command")
     for name, add, explained in (
         ("diagnose", diagnose.add_arguments, "name the cause, from measured data"),
-        ("audit", logs.add_audit, "find defects of measured data"),
+        ("audit", logs.add_audit, "find defects in measured data"),
         ("calibrate", calibrate.add_arguments, "estimate parameters of a twin from measured data"),
-        ("robustness", robustness.add_arguments, "return under noise, failed sensors, pushes"),
-        ("columns", logs.add_columns, "list what is in a log, with a map to start from"),
-        ("export", deployment.add_export, "write a policy as ONNX, or as a header of C"),
-        ("run", deployment.add_run, "act by an exported policy, in real time, and record it"),
-        ("study", study.add_arguments, "run algorithms on environments, with seeds, and report"),
-        ("effects", catalogue.add_effects, "list the candidates, with units and explanations"),
-        (
-            "twins",
-            catalogue.add_twins,
-            "list the simulations, with their parameters, or check one",
-        ),
+        ("robustness", robustness.add_arguments, "return under noise, failed sensors and pushes"),
+        ("columns", logs.add_columns, "list the signals of a log, with a map to start from"),
+        ("export", deployment.add_export, "export a policy as an ONNX file or a C header"),
+        ("run", deployment.add_run, "run an exported policy in real time and record it"),
+        ("study", study.add_arguments, "run algorithms on environments over seeds, and report"),
+        ("effects", catalogue.add_effects, "list the candidate effects, with units"),
+        ("twins", catalogue.add_twins, "list the twins with their parameters, or check one"),
     ):
         add(commands.add_parser(name, help=explained))
     return top

@@ -12,10 +12,10 @@ _UNKNOWN = "unrecognized arguments: "
 
 
 class Parser(argparse.ArgumentParser):
-    """An ``ArgumentParser`` whose errors are one line, with the nearest name that there is."""
+    """An ``ArgumentParser`` whose errors are one line, with the nearest known name."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """What a command does not know is refused by the command, which knows its own options."""
+        """Let the subparser refuse unknown arguments, since it knows the options of its command."""
         given, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"{_UNKNOWN}{' '.join(unknown)}")
@@ -23,8 +23,8 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """:raises SystemExit: with 2"""
-        if wrong := _CHOICE.match(message):
-            argument, word, listed = wrong.groups()
+        if invalid := _CHOICE.match(message):
+            argument, word, listed = invalid.groups()
             choices = re.findall(r"[\w-]+", listed)
             kind = "command" if argument == "command" else argument
             known = f" There are: {', '.join(choices)}."
@@ -32,18 +32,18 @@ class Parser(argparse.ArgumentParser):
         elif message.startswith(_UNKNOWN):
             words = message.removeprefix(_UNKNOWN).split()
             options = re.findall(r"--[\w-]+", self.format_help())
-            wrong = next((word for word in words if word.startswith("-")), "")
-            meant = did_you_mean(wrong.partition("=")[0], dict.fromkeys(options))
-            message = f"unknown {'option' if wrong else 'argument'} '{wrong or words[0]}'.{meant}"
-        ended = message if message.endswith((".", "?")) else f"{message}."
-        self.exit(2, f"{self.prog}: {ended} See '{self.prog} --help'.\n")
+            option = next((word for word in words if word.startswith("-")), "")
+            hint = did_you_mean(option.partition("=")[0], dict.fromkeys(options))
+            message = f"unknown {'option' if option else 'argument'} '{option or words[0]}'.{hint}"
+        sentence = message if message.endswith((".", "?")) else f"{message}."
+        self.exit(2, f"{self.prog}: {sentence} See '{self.prog} --help'.\n")
 
 
 class Version(argparse.Action):
-    """``--version``: looked up only where it is asked for."""
+    """``--version``, looked up on request only."""
 
     def __init__(self, option_strings: Sequence[str], dest: str) -> None:
-        super().__init__(option_strings, dest, nargs=0, help="print the version, and stop")
+        super().__init__(option_strings, dest, nargs=0, help="print the version and exit")
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         from importlib.metadata import PackageNotFoundError, version
@@ -57,16 +57,16 @@ class Version(argparse.Action):
 
 
 def names(words: Sequence[str]) -> list[str]:
-    """Words that blanks or commas separate."""
+    """Split words at commas."""
     return [name for word in words for name in word.split(",") if name]
 
 
 def settings(option: str, texts: Sequence[str]) -> dict[str, Any]:
     """
-    :param option: in whose name an error speaks
+    :param option: to name in an error message
     :param texts: ``NAME:VALUE`` each
-    :return: numbers, truth values and words, by name
-    :raises ParameterError: for another form
+    :return: values by name: bool, int, float or str
+    :raises ParameterError: for text of another form
     """
     found: dict[str, Any] = {}
     for text in texts:

@@ -13,37 +13,41 @@ from sb3_hds.errors import ParameterError
 def add_export(command: argparse.ArgumentParser) -> None:
     """:param command: ``sb3-hds export``"""
     command.add_argument(
-        "model", metavar="MODEL", help="zip file of a saved model, or an .onnx file, for --c"
+        "model", metavar="MODEL", help="zip file of a saved model; with --c, also an .onnx file"
     )
     command.add_argument("onnx", nargs="?", metavar="FILE.onnx", help="ONNX file to write")
-    command.add_argument("--c", metavar="FILE.h", help="header of C99 to write")
+    command.add_argument("--c", metavar="FILE.h", help="C99 header to write")
     command.add_argument(
         "--algo",
-        help="id in the zoo, or a class, sbx.SAC: who saved the model, where that was another "
-        "library; its file is then unpickled",
+        help="algorithm of a model that another library saved: an id in the zoo, or a class such as "
+        "sbx.SAC; the file is then unpickled",
     )
     policies.add_env(
-        command, "as trained in: tells names, units, the length of a step", required=False
+        command,
+        "environment of the training, for names, units and the control interval",
+        required=False,
     )
     command.add_argument(
-        "--vecnormalize", metavar="FILE.pkl", help="of the training; it is unpickled"
+        "--vecnormalize", metavar="FILE.pkl", help="file saved in the training; it is unpickled"
     )
     command.add_argument(
-        "--no-layers", action="store_true", help="leave all wrappers to where the file runs"
+        "--no-layers",
+        action="store_true",
+        help="export the bare policy: keep wrappers of sb3_hds.wrappers out of the file",
     )
-    command.add_argument("--dt", type=float, help="how long a step is [s]")
+    command.add_argument("--dt", type=float, help="control interval [s]")
     command.set_defaults(run=run_export)
 
 
 def run_export(given: argparse.Namespace) -> None:
-    """Export, and tell what was written."""
+    """Export, and print what was written."""
     from sb3_hds.core.trajectories.storage import check_target
     from sb3_hds.deploy import export_c, export_onnx
 
     exported = Path(given.model).suffix == ".onnx"
     if exported and given.onnx:
         raise ParameterError(
-            f"{given.model} is exported already. Name a saved model, or only --c {given.onnx}."
+            f"{given.model} is already exported. Name a saved model, or only --c {given.onnx}."
         )
     if not (given.onnx or given.c):
         raise ParameterError("Name a file to write: policy.onnx, or --c policy.h.")
@@ -76,18 +80,18 @@ def run_export(given: argparse.Namespace) -> None:
 
 def add_run(command: argparse.ArgumentParser) -> None:
     """:param command: ``sb3-hds run``"""
-    command.add_argument("policy", metavar="FILE.onnx", help="of 'sb3-hds export'")
-    policies.add_env(command, "environment id: a simulation, or a robot")
+    command.add_argument("policy", metavar="FILE.onnx", help="file from 'sb3-hds export'")
+    policies.add_env(command, "environment id, of a simulation or a robot")
     command.add_argument("--rate", type=float, help="steps per second [Hz]; default: as trained")
-    command.add_argument("--episodes", type=int, default=1, help="default: 1")
-    command.add_argument("--steps", type=int, help="after which it ends in any case")
-    command.add_argument("--seed", type=int, help="of the first reset")
+    command.add_argument("--episodes", type=int, default=1, help="number of episodes; default: 1")
+    command.add_argument("--steps", type=int, help="maximum number of steps in total")
+    command.add_argument("--seed", type=int, help="seed of the first reset")
     command.add_argument(
         "--safe-action",
         type=float,
         nargs="+",
         metavar="NUMBER",
-        help="what a watchdog commands where the policy is late; default: there is no watchdog",
+        help="command of the watchdog when the policy is late; default: no watchdog",
     )
     command.add_argument(
         "--record",
@@ -95,12 +99,12 @@ def add_run(command: argparse.ArgumentParser) -> None:
         help="recording to write, for 'sb3-hds diagnose'; default: POLICY-DATE.jsonl beside the "
         "policy; '-': none",
     )
-    command.add_argument("--condition", default="default", help="label of what is recorded")
+    command.add_argument("--condition", default="default", help="label of the recording")
     command.set_defaults(run=run_policy_file)
 
 
 def run_policy_file(given: argparse.Namespace) -> None:
-    """Act at the policy's rate, and tell what it took."""
+    """Act at the policy's rate, and print the latencies."""
     from sb3_hds.deploy import OnnxPolicy, run_policy
 
     policy = OnnxPolicy(given.policy)

@@ -25,10 +25,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--calibrate",
         nargs="*",
         default=[],
-        help="parameters of which the nominal value is not trusted",
+        help="parameters to estimate as well, since their nominal values are uncertain",
     )
     command.add_argument(
-        "--effects", nargs="*", help="candidates; default: all, see 'sb3-hds effects'"
+        "--effects", nargs="*", help="candidate effects; default: all, see 'sb3-hds effects'"
     )
     command.add_argument("--budget", choices=("full", "quick"), default="full")
     command.add_argument("--seed", type=int, default=0)
@@ -36,33 +36,47 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--animate", help="MP4 film to write: measured and predicted motion")
     command.add_argument("--json", help="JSON file to write")
     measured.add_write(command)
-    design = command.add_argument_group("what to record next", "commands that decide what is open")
-    design.add_argument("--next", metavar="FILE", help="CSV or NPZ file of commands to write")
-    design.add_argument("--limits", metavar="FILE", help="yml file: what the machine may do")
-    design.add_argument("--recordings", type=int, default=1, help="to design; default: 1")
-    design.add_argument("--seconds", type=float, default=10.0, help="of each; default: 10")
-    gain = command.add_argument_group("policy gain", "policies from both twins, on the real system")
+    design = command.add_argument_group(
+        "next experiment", "commands that distinguish the remaining hypotheses"
+    )
+    design.add_argument("--next", metavar="FILE", help="CSV or NPZ file to write the commands to")
+    design.add_argument("--limits", metavar="FILE", help="yml file with the limits of the machine")
+    design.add_argument(
+        "--recordings", type=int, default=1, help="number of recordings to design; default: 1"
+    )
+    design.add_argument(
+        "--seconds", type=float, default=10.0, help="length of a recording [s]; default: 10"
+    )
+    gain = command.add_argument_group(
+        "policy gain", "returns on the real system of policies trained in each twin"
+    )
     gain.add_argument("--env", help="id of the real system")
-    gain.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE", help="of it")
-    gain.add_argument("--algo", default="hds", help="id in the zoo; default: hds")
-    gain.add_argument("--policies", type=int, default=5, help="trained in each twin; default: 5")
-    gain.add_argument("--policy-budget", type=int, default=0, help="steps of training in a twin")
-    gain.add_argument("--episodes", type=int, default=20, help="for each policy; default: 20")
     gain.add_argument(
-        "--hyperparams", nargs="*", default=[], metavar="NAME:VALUE", help="of the algorithm"
+        "--env-kwargs",
+        nargs="*",
+        default=[],
+        metavar="NAME:VALUE",
+        help="arguments of the environment",
+    )
+    gain.add_argument("--algo", default="hds", help="id of the algorithm in the zoo; default: hds")
+    gain.add_argument("--policies", type=int, default=5, help="policies per twin; default: 5")
+    gain.add_argument("--policy-budget", type=int, default=0, help="training steps per policy")
+    gain.add_argument("--episodes", type=int, default=20, help="episodes per policy; default: 20")
+    gain.add_argument(
+        "--hyperparams", nargs="*", default=[], metavar="NAME:VALUE", help="hyperparameters"
     )
     command.set_defaults(run=run)
 
 
 def run(given: argparse.Namespace) -> None:
-    """Load, diagnose, and report: on the screen, as a page, as JSON."""
+    """Load the data, diagnose, and report on the screen, as a page and as JSON."""
     from sb3_hds.data import audit
     from sb3_hds.effects import ALL
     from sb3_hds.sysid import diagnose
 
     _check_targets(given)
-    twin, data = measured.question(given)
-    measure = None if given.env is None else _policy_question(given, twin)
+    twin, data = measured.twin_and_data(given)
+    measure = None if given.env is None else _policy_comparison(given, twin)
     corrections: tuple[str, ...] = ()
     if given.correct:
         checked = audit(data, twin=twin)
@@ -80,11 +94,11 @@ def run(given: argparse.Namespace) -> None:
     print(found)
     plain, gain = found.to_dict(), None
     if measure is not None and found.twin.values == found.believed.values:
-        print("The twin is left as it was, so there are no policies to compare.")
+        print("The twin is unchanged, so there are no policies to compare.")
     elif measure is not None:
-        bought = measure(found)
-        print(bought)
-        plain["policy_gain"] = gain = bought.to_dict()
+        comparison = measure(found)
+        print(comparison)
+        plain["policy_gain"] = gain = comparison.to_dict()
     if given.json:
         measured.write_json(given.json, plain)
     measured.write_twin(given, found.twin)
@@ -92,32 +106,32 @@ def run(given: argparse.Namespace) -> None:
         print("Nothing was simulated, so there is no film.")
     elif given.animate:
         print(f"The film is {found.to_film(given.animate)}.")
-    experiment = _next(given, found)
+    experiment = _next_experiment(given, found)
     if given.report:
         print(f"The report is {found.to_html(given.report, gain, experiment)}.")
 
 
-def _next(given: argparse.Namespace, found: "Diagnosis") -> "NextExperiment | None":
-    """Design what ``--next`` asks for, print it and write its commands."""
+def _next_experiment(given: argparse.Namespace, found: "Diagnosis") -> "NextExperiment | None":
+    """Design the experiment of ``--next``, print it and write its commands."""
     if not given.next:
         return None
     if found.opened is None:
-        print("No cause was looked for, so there is nothing to record next.")
+        print("No cause was searched for, so there is no next experiment to design.")
         return None
-    told = found.next_experiment(
+    experiment = found.next_experiment(
         given.limits,
         n=given.recordings,
         seconds=given.seconds,
         seed=given.seed,
         progress=sys.stderr.isatty(),
     )
-    print(told)
-    print(f"The commands are {told.save(given.next)}.")
-    return told
+    print(experiment)
+    print(f"The commands are {experiment.save(given.next)}.")
+    return experiment
 
 
 def _check_targets(given: argparse.Namespace) -> None:
-    """Fail early: check everything that would fail after the diagnosis."""
+    """Check before the diagnosis everything that could fail after it."""
     measured.check_targets(given)
     if given.animate:
         from sb3_hds.sysid.reporting.film import check_film
@@ -139,16 +153,16 @@ def _check_next(given: argparse.Namespace) -> None:
     check_file(given.next)
     if not given.limits:
         raise ParameterError(
-            "--next chooses commands for a real machine: say what it may do, --limits limits.yml "
+            "--next designs commands for a real machine: give its limits, --limits limits.yml, "
             "with lines such as 'velocity: 6.0' or 'torque: {shoulder: 2.0}'."
         )
     Limits.of(given.limits)
 
 
-def _policy_question(
+def _policy_comparison(
     given: argparse.Namespace, twin: "Twin"
 ) -> "Callable[[Diagnosis], PolicyGain]":
-    """The comparison of policies, to be run on a diagnosis; its arguments are checked now."""
+    """Check the arguments of the policy comparison; return the function that runs it."""
     import gymnasium
 
     from sb3_hds.experiments import measure_policy_gain

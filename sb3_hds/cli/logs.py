@@ -11,13 +11,13 @@ from sb3_hds.errors import ParameterError
 def add_columns(command: argparse.ArgumentParser) -> None:
     """:param command: ``sb3-hds columns``"""
     command.add_argument("file", metavar="FILE", help="a log of any format, or a folder with a bag")
-    command.add_argument("--records", help="where the rows are in a file that nests them: data")
-    command.add_argument("--skip", type=int, help="lines of a text file before its names")
+    command.add_argument("--records", help="key of the rows in a nested file: data")
+    command.add_argument("--skip", type=int, help="lines of a text file before its header")
     command.set_defaults(run=run_columns)
 
 
 def run_columns(given: argparse.Namespace) -> None:
-    """Print valid yml: ``sb3-hds columns log.csv > map.yml``."""
+    """Print a map of columns as valid yml: ``sb3-hds columns log.csv > map.yml``."""
     from sb3_hds.data.overview import describe
 
     print(describe(Path(given.file).expanduser(), given.records, given.skip))
@@ -35,11 +35,13 @@ def run_audit(given: argparse.Namespace) -> None:
     from sb3_hds.data import audit
 
     measured.check_targets(given)
-    alone = given.twin is None and given.model is None
-    if given.set and alone:
+    without_twin = given.twin is None and given.model is None
+    if given.set and without_twin:
         raise ParameterError("--set changes the twin: name one with --twin, or --model.")
     twin, data = (
-        (None, measured.data_of(given, given.columns)) if alone else measured.question(given)
+        (None, measured.data_of(given, given.columns))
+        if without_twin
+        else measured.twin_and_data(given)
     )
     plain: dict[str, Any] = {}
     if data.report is not None:
@@ -52,8 +54,8 @@ def run_audit(given: argparse.Namespace) -> None:
         plain["corrections"] = list(found.corrections)
         print("\n" + ("\n".join(found.corrections) or "There is nothing to correct."))
     if given.correct and found.corrections:
-        better = audit(found.corrected(data), twin=twin)
-        plain["corrected"] = better.to_dict()
-        print(f"\n{better}")
+        corrected = audit(found.corrected(data), twin=twin)
+        plain["corrected"] = corrected.to_dict()
+        print(f"\n{corrected}")
     if given.json:
         measured.write_json(given.json, plain)

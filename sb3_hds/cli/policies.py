@@ -8,8 +8,8 @@ from typing import Any
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError, did_you_mean
 from sb3_hds.wrappers.by_name import imported
 
-# Ids that rl_zoo3 has by itself, and where their classes are.
-_THEIRS = {
+# The classes of rl_zoo3's own ids.
+_OF_RL_ZOO = {
     "a2c": "stable_baselines3.A2C",
     "ddpg": "stable_baselines3.DDPG",
     "dqn": "stable_baselines3.DQN",
@@ -27,20 +27,20 @@ _THEIRS = {
 
 def algorithm(name: str) -> Any:
     """
-    :param name: id of ours or of RL Zoo, or the path of a class
-    :raises ParameterError: if there is none, or if it loads no model
+    :param name: id of ours or of RL Zoo, or the dotted name of a class
+    :raises ParameterError: if there is none, or if it cannot load models
     """
     from sb3_hds.algos import ALL
 
     if name in ALL:
         return ALL[name]
-    if name not in _THEIRS and "." not in name:
-        known = [*ALL, *_THEIRS]
+    if name not in _OF_RL_ZOO and "." not in name:
+        known = [*ALL, *_OF_RL_ZOO]
         raise ParameterError(
             f"There is no algorithm '{name}'.{did_you_mean(name.lower(), known)} There are: "
             f"{', '.join(known)}; or name a class: sbx.SAC."
         )
-    found = imported(_THEIRS.get(name, name), "class")
+    found = imported(_OF_RL_ZOO.get(name, name), "class")
     if not hasattr(found, "load"):
         raise ParameterError(f"'{name}' is {found!r}, which is no algorithm: it loads no model.")
     return found
@@ -49,8 +49,8 @@ def algorithm(name: str) -> Any:
 def load_policy(path: str, algo: str | None) -> Any:
     """
     :param path: of a saved model
-    :param algo: as for :func:`algorithm`; None: the file says it
-    :raises FileNotFoundError: for a file that there is not, with the nearest that there is
+    :param algo: as for :func:`algorithm`; None: read from the file
+    :raises FileNotFoundError: for a missing file, with the nearest name in its folder
     :raises ParameterError: for a file that holds no model of that algorithm
     """
     from sb3_hds import algos
@@ -88,16 +88,16 @@ def add_env(command: argparse.ArgumentParser, explained: str, *, required: bool 
         nargs="*",
         default=[],
         metavar="CLASS",
-        help="as trained, the one next to the environment first: package.Wrapper, or with "
+        help="wrappers of the training, the innermost first: package.Wrapper, or with "
         "arguments as in yml, 'package.Wrapper: {cutoff: 4.0}'",
     )
 
 
 def bare_environment(given: argparse.Namespace) -> Any:
     """
-    :return: that of ``--env`` and ``--env-kwargs``
+    :return: the environment of ``--env`` and ``--env-kwargs``
     :raises ParameterError: for arguments of another form
-    :raises EnvironmentMismatchError: where there is no such environment
+    :raises EnvironmentMismatchError: if there is no such environment
     """
     import gymnasium
     import yaml
@@ -123,7 +123,7 @@ def bare_environment(given: argparse.Namespace) -> Any:
 
 def wrapped(given: argparse.Namespace, env: Any) -> Any:
     """
-    :return: the environment in the wrappers of ``--env-wrapper``, the first of them next to it
+    :return: the environment in the wrappers of ``--env-wrapper``, the first innermost
     :raises ParameterError: for another form, or a class that cannot be imported
     """
     for wrapper, arguments in map(_wrapper, given.env_wrapper):
