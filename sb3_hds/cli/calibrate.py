@@ -27,7 +27,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         nargs="*",
         default=[],
         metavar="NAME[.LOCATION]",
-        help="effects of 'sb3-hds effects' to extend the twin by first, at all locations or at one: "
+        help="effects ('sb3-hds effects') to extend the twin by first, at all locations or at one: "
         "action_delay, coulomb_friction.hinge",
     )
     command.add_argument(

@@ -19,7 +19,7 @@ def add_export(command: argparse.ArgumentParser) -> None:
     command.add_argument("--c", metavar="FILE.h", help="C99 header to write")
     command.add_argument(
         "--algo",
-        help="algorithm of a model that another library saved: an id in the zoo, or a class such as "
+        help="algorithm of a model that another library saved: an id in the zoo, or a class, "
         "sbx.SAC; the file is then unpickled",
     )
     policies.add_env(
@@ -47,7 +47,7 @@ def run_export(given: argparse.Namespace) -> None:
     exported = Path(given.model).suffix == ".onnx"
     if exported and given.onnx:
         raise ParameterError(
-            f"{given.model} is already exported. Name a saved model, or only --c {given.onnx}."
+            f"{given.model} is exported already. Name a saved model, or only --c {given.onnx}."
         )
     if not (given.onnx or given.c):
         raise ParameterError("Name a file to write: policy.onnx, or --c policy.h.")
