@@ -95,7 +95,8 @@ def export_c(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> He
         ) from error
     policy = OnnxPolicy(source)
     name = _identifier(Path(path).stem)
-    translation = Translation(onnx.load(os.fspath(source)), _inputs(policy))
+    shapes = {port: (1, *shape) for port, shape in policy._shapes.items()}
+    translation = Translation(onnx.load(os.fspath(source)), shapes)
     text = _header(name, policy, translation, Path(source).name)
     header = Header(
         Path(path),
@@ -106,7 +107,7 @@ def export_c(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> He
     )
     compiler = shutil.which("cc")
     if compiler is not None:
-        error, median, worst = _checked(compiler, name, text, policy)
+        error, median, worst = _checked(compiler, name, text, policy, translation)
         if not error <= TOLERANCE:
             raise ExportError(
                 f"The header would compute something else: actions differ from onnxruntime by "
@@ -129,11 +130,6 @@ def _identifier(stem: str) -> str:
             "with a letter."
         )
     return found
-
-
-def _inputs(policy: OnnxPolicy) -> dict[str, tuple[int, ...]]:
-    """Shapes of the inputs, for a batch of one."""
-    return {name: (1, *policy._shapes[name]) for name in policy._dtypes}
 
 
 def _header(name: str, policy: OnnxPolicy, translation: Translation, source: str) -> str:
@@ -241,12 +237,14 @@ def _main(
     return lines
 
 
-def _checked(compiler: str, name: str, text: str, policy: OnnxPolicy) -> tuple[float, float, float]:
+def _checked(
+    compiler: str, name: str, text: str, policy: OnnxPolicy, translation: Translation
+) -> tuple[float, float, float]:
     """The largest error, and the median and the worst time of a call [s]."""
-    rng, shapes = np.random.default_rng(0), _inputs(policy)
+    rng = np.random.default_rng(0)
     memory = {part["input"] for part in policy.metadata["memory"]}
-    own = [port for port in shapes if port not in memory]
-    rows = {port: _drawn(policy, port, shapes[port][1:], rng) for port in own}
+    own = [port for port in translation.inputs if port not in memory]
+    rows = {port: _drawn(policy, port, rng) for port in own}
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, f"{name}.h").write_text(text)
         _compile(compiler, folder, ["-x", "c", f"{name}.h", f"-D{name.upper()}_MAIN"], name)
@@ -254,56 +252,38 @@ def _checked(compiler: str, name: str, text: str, policy: OnnxPolicy) -> tuple[f
         given = "\n".join(" ".join(map(repr, row)) for row in flat.astype(float).tolist())
         found = _output([str(Path(folder, name))], given)
         found = np.array([list(map(float, line.split())) for line in found.splitlines()])
-        Path(folder, "timed.c").write_text(_timed(name, policy, shapes, own))
+        Path(folder, "timed.c").write_text(_timed(name, translation, own, bool(memory)))
         _compile(compiler, folder, ["-D_POSIX_C_SOURCE=199309L", "timed.c"], "timed")
         median, worst = map(float, _output([str(Path(folder, "timed"))], "").split())
     wanted, state = [], None
     for k in range(N_CHECKED):
-        one = {port: part[k] for port, part in rows.items()}
-        action, state = policy.predict(_observed(policy, one), state, joints=_joints(one))
+        now = {port: part[k] for port, part in rows.items()}
+        parts = {key: now[port] for port, key in policy._keys.items()}
+        observed = parts if all(parts) else next(iter(parts.values()))
+        joints = (now["joint_position"], now["joint_velocity"]) if policy.joints else None
+        action, state = policy.predict(observed, state, joints=joints)
         wanted.append(np.ravel(action))
-    differences = np.abs(found - np.array(wanted, float)) / _halves(policy)
+    ends = [(a.get("low"), a.get("high")) for a in policy.metadata["actions"]]
+    halves = np.array([1.0 if None in e else 0.5 * (e[1] - e[0]) for e in ends])
+    differences = np.abs(found - np.array(wanted, float)) / halves
     return float(differences.max()), median, worst
 
 
-def _drawn(
-    policy: OnnxPolicy, port: str, shape: tuple[int, ...], rng: np.random.Generator
-) -> np.ndarray:
+def _drawn(policy: OnnxPolicy, port: str, rng: np.random.Generator) -> np.ndarray:
+    shape = (N_CHECKED, *policy._shapes[port])
     if issubclass(policy._dtypes[port], np.integer):
-        return rng.integers(0, 2, (N_CHECKED, *shape))
-    return (2.0 * rng.standard_normal((N_CHECKED, *shape))).astype(np.float32)
+        return rng.integers(0, 2, shape)
+    return (2.0 * rng.standard_normal(shape)).astype(np.float32)
 
 
-def _observed(policy: OnnxPolicy, one: Mapping[str, np.ndarray]) -> Any:
-    parts = {key: one[port] for port, key in policy._keys.items()}
-    return parts if all(parts) else next(iter(parts.values()))
-
-
-def _joints(one: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
-    if "joint_position" not in one:
-        return None
-    return one["joint_position"], one["joint_velocity"]
-
-
-def _halves(policy: OnnxPolicy) -> np.ndarray:
-    ends = [(a.get("low"), a.get("high")) for a in policy.metadata["actions"]]
-    return np.array([1.0 if None in e else 0.5 * (e[1] - e[0]) for e in ends])
-
-
-def _timed(
-    name: str, policy: OnnxPolicy, shapes: Mapping[str, tuple[int, ...]], own: Sequence[str]
-) -> str:
+def _timed(name: str, translation: Translation, own: Sequence[str], state: bool) -> str:
     """A program that prints the median and the worst time of a call [s]."""
-    kinds = {np.float32: "float", np.float64: "double", np.int64: "long long", np.int32: "int"}
-    state = bool(policy.metadata["memory"])
-    symbols = [_identifier(port) for port in own]
+    symbols = [translation.symbol(port) for port in own]
     declared = "".join(
-        f"    static {kinds[policy._dtypes[port]]} {symbol}[{int(np.prod(shapes[port]))}];\n"
+        f"    static {translation.kind(port)} {symbol}[{translation.size(port)}];\n"
         for port, symbol in zip(own, symbols, strict=True)
     )
-    # The kind of the first output is that of the action.
-    kind = policy._session.get_outputs()[0].type
-    action = {"tensor(float)": "float", "tensor(double)": "double", "tensor(int64)": "long long"}
+    action = translation.kind(translation.outputs["action"])
     call = ", ".join([*symbols, *(["&state"] if state else []), "action"])
     return f"""#include <stdio.h>
 #include <stdlib.h>
@@ -315,12 +295,12 @@ static int compare(const void *a, const void *b) {{
 }}
 int main(void) {{
     static double seconds[{N_TIMED}];
-{declared}    static {action.get(kind, "int")} action[{name.upper()}_N_ACTION];
+{declared}    static {action} action[{name.upper()}_N_ACTION];
     {f"{name}_state state; {name}_reset(&state);" if state else ""}
     struct timespec begin, end;
     int k;
     for (k = 0; k < {N_TIMED}; ++k) {{
-        {symbols[0]}[0] = ({kinds[policy._dtypes[own[0]]]})(k % 2);
+        {symbols[0]}[0] = ({translation.kind(own[0])})(k % 2);
         clock_gettime(CLOCK_MONOTONIC, &begin);
         {name}_step({call});
         clock_gettime(CLOCK_MONOTONIC, &end);

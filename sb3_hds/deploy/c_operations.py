@@ -18,7 +18,6 @@ from sb3_hds.deploy.c_text import (
     over_last,
     place_of,
 )
-from sb3_hds.deploy.conversion import attributes_of, evaluated, numpy_type
 from sb3_hds.errors import ExportError
 
 # What only moves numbers: its effect on their places is found by moving the places themselves.
@@ -45,14 +44,16 @@ class Translation:
     """
 
     def __init__(self, proto: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        from onnx import numpy_helper
+        from onnx import helper, numpy_helper
         from onnx.reference import ReferenceEvaluator
 
         self._opset = list(proto.opset_import)
         graph = proto.graph
         held = {part.name: numpy_helper.to_array(part) for part in graph.initializer}
         zeros = {
-            port.name: np.zeros(shapes[port.name], numpy_type(port.type.tensor_type.elem_type))
+            port.name: np.zeros(
+                shapes[port.name], helper.tensor_dtype_to_np_dtype(port.type.tensor_type.elem_type)
+            )
             for port in graph.input
         }
         with np.errstate(all="ignore"):
@@ -141,7 +142,7 @@ class Translation:
     def _translate(self, node: Any) -> None:
         inputs = [name for name in node.input if name]
         kind = node.op_type
-        attributes = attributes_of(node)
+        attributes = _attributes_of(node)
         if not any(map(self.size, node.output)):
             return
         if kind in _MOVES:
@@ -248,7 +249,7 @@ class Translation:
             else:
                 given.append(value)
         ends = np.cumsum([0, *(self.size(name) for name in data)])
-        for output, places in zip(node.output, evaluated(node, given, self._opset), strict=True):
+        for output, places in zip(node.output, _evaluated(node, given, self._opset), strict=True):
             table = np.asarray(places).ravel()
             whole = table.size and np.array_equal(table, np.arange(ends[1]))
             if whole and len(data) == 1:
@@ -322,24 +323,18 @@ class Translation:
 
     def _reduce(self, node: Any, inputs: Sequence[str]) -> None:
         n_outer, n = self._last(node, inputs)
-        first, each, after = REDUCED[node.op_type]
         x = f"({self._read(inputs[0])} + j * {n})"
         fill = {"x": x, "v": f"{x}[k]", "n": str(n)}
-        self._rows(
-            node, n_outer, n, first.format(**fill), each.format(**fill), after.format(**fill)
-        )
-
-    def _rows(self, node: Any, n_outer: int, n: int, first: str, each: str, after: str) -> None:
-        output = node.output[0]
+        total, term, result = (text.format(**fill) for text in REDUCED[node.op_type])
         self.n_operations += n_outer * n
         self._statements.append(
-            f"for (j = 0; j < {n_outer}; ++j) {{ {self.kind(output)} total = {first}; "
-            f"for (k = 0; k < {n}; ++k) {each} {self._new(output)}[j] = {after}; }}"
+            f"for (j = 0; j < {n_outer}; ++j) {{ {self.kind(node.output[0])} total = {total}; "
+            f"for (k = 0; k < {n}; ++k) {term} {self._new(node.output[0])}[j] = {result}; }}"
         )
 
     def _last(self, node: Any, inputs: Sequence[str]) -> tuple[int, int]:
         """How many rows, and how long they are, where an operation goes over the last axes."""
-        value, attributes = self._values[inputs[0]], attributes_of(node)
+        value, attributes = self._values[inputs[0]], _attributes_of(node)
         axes = attributes.get("axes", attributes.get("axis"))
         if len(inputs) > 1:
             axes = self._values[inputs[1]].ravel().tolist()
@@ -369,9 +364,30 @@ class Translation:
 
     def _over_last(self, node: Any, inputs: Sequence[str]) -> None:
         kind, output = node.op_type, node.output[0]
-        n_outer, n = (
-            self._last(node, inputs[:1]) if kind != "ReduceLogSumExp" else self._last(node, inputs)
-        )
+        n_outer, n = self._last(node, inputs)
         x, y = f"({self._read(inputs[0])} + j * {n})", self._new(output)
         self.n_operations += 3 * n_outer * n
         self._statements.append(over_last(kind, self.kind(inputs[0]), (n_outer, n), (x, y)))
+
+
+def _attributes_of(node: Any) -> dict[str, Any]:
+    from onnx import helper
+
+    found = {part.name: helper.get_attribute_value(part) for part in node.attribute}
+    return {k: v.decode() if isinstance(v, bytes) else v for k, v in found.items()}
+
+
+def _evaluated(node: Any, given: Sequence[np.ndarray], opset: Sequence[Any]) -> list[Any]:
+    """What an operation does to these arrays, by ONNX's reference implementation."""
+    from onnx import helper
+    from onnx.reference import ReferenceEvaluator
+
+    # Each input gets a name of its own: a node may read one array twice.
+    names = [f"x{i}" if name else "" for i, name in enumerate(node.input)]
+    copy = type(node)()
+    copy.CopyFrom(node)
+    copy.input[:] = names
+    used = [name for name in names if name]
+    function = helper.make_function("", "one", used, node.output, [copy], opset)
+    values = dict(zip(used, given, strict=True))
+    return ReferenceEvaluator(function).run(None, values, {})  # type: ignore[return-value]

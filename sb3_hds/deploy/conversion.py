@@ -1,17 +1,20 @@
-"""Functions of JAX and modules of torch as ONNX models, by the converters of those libraries."""
+"""Functions of JAX and policies of torch as ONNX models, by the converters of those libraries."""
 
 import contextlib
 import io
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import torch as th
+from gymnasium import spaces
 from jax.extend.core import Literal
 
+from sb3_hds.deploy.observations import WHOLE, Normalization, Port, parts_of
 from sb3_hds.errors import ExportError
 
 #: of the operators, and of the file: onnxruntime 1.14 (February 2023) reads both
@@ -19,19 +22,6 @@ OPSET, IR_VERSION = 18, 8
 BATCH = "batch"
 # Calls whose content is evaluated in their place.
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
-
-
-class Port(NamedTuple):
-    """
-    An input or an output.
-
-    :param shape: without the axis of the batch
-    :param dtype: as NumPy names it
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    dtype: str
 
 
 def from_jax(
@@ -49,7 +39,10 @@ def from_jax(
     :raises ExportError: for an operation that jax2onnx does not know
     :raises ImportError: without the extra ``onnx``
     """
-    to_onnx = _jax2onnx()
+    try:
+        from jax2onnx import to_onnx
+    except ImportError as error:
+        raise _missing("jax2onnx") from error
     double = any(port.dtype == "float64" for port in inputs)
     with _quiet(), jax.enable_x64(double):
         batch = jax.export.symbolic_shape(BATCH)
@@ -73,16 +66,27 @@ def from_jax(
             ) from error
 
 
-def from_torch(module: Any, inputs: Sequence[Port], outputs: Sequence[str]) -> Any:
+def from_torch(
+    policy: Any,
+    inputs: Sequence[Port],
+    outputs: Sequence[str],
+    by: Mapping[str, Normalization],
+) -> Any:
     """
-    :param module: a ``torch.nn.Module`` of arrays with a leading axis
+    :param policy: of Stable-Baselines3
+    :param inputs: one for each part of an observation
+    :param by: normalisation of its observations
     :return: an ``onnx.ModelProto``
     :raises ExportError: for an operation that torch does not export
     :raises ImportError: without the extra ``onnx``
     """
-    import torch as th
-
-    onnx = _onnx()
+    try:
+        import onnx
+    except ImportError as error:
+        raise _missing("onnx") from error
+    policy.set_training_mode(False)
+    keys = list(parts_of(policy.observation_space))
+    module = _DeterministicPolicy(policy, keys, by)
     example = tuple(th.zeros((2, *p.shape), dtype=getattr(th, p.dtype)) for p in inputs)
     names = [port.name for port in inputs]
     file = io.BytesIO()
@@ -105,20 +109,36 @@ def from_torch(module: Any, inputs: Sequence[Port], outputs: Sequence[str]) -> A
     return onnx.load_from_string(file.getvalue())
 
 
-def _jax2onnx() -> Any:
-    try:
-        from jax2onnx import to_onnx
-    except ImportError as error:
-        raise _missing("jax2onnx") from error
-    return to_onnx
+class _DeterministicPolicy(th.nn.Module):
+    """
+    :param policy: of Stable-Baselines3
+    :param by: normalisation of its observations
+    """
 
+    def __init__(self, policy: Any, keys: Sequence[str], by: Mapping[str, Normalization]) -> None:
+        super().__init__()
+        self.policy, self.keys, self.by = policy, keys, by
+        self.space = policy.action_space
 
-def _onnx() -> Any:
-    try:
-        import onnx
-    except ImportError as error:
-        raise _missing("onnx") from error
-    return onnx
+    def forward(self, *inputs: th.Tensor) -> th.Tensor:
+        """:return: actions in the units of the action space"""
+        seen = {key: self._normalized(key, x) for key, x in zip(self.keys, inputs, strict=True)}
+        action = self.policy._predict(seen.get(WHOLE, seen), deterministic=True).reshape(
+            -1, *self.space.shape
+        )
+        if not isinstance(self.space, spaces.Box):
+            return action
+        low, high = th.as_tensor(self.space.low), th.as_tensor(self.space.high)
+        if self.policy.squash_output:
+            action = low + 0.5 * (action + 1.0) * (high - low)
+        return th.clamp(action, low, high)
+
+    def _normalized(self, key: str, values: th.Tensor) -> th.Tensor:
+        by = self.by.get(key)
+        if by is None:
+            return values
+        mean, scale = (th.as_tensor(part, dtype=values.dtype) for part in (by.mean, by.scale))
+        return th.clamp((values - mean) / scale, -by.clip, by.clip)
 
 
 def _missing(name: str) -> ImportError:
@@ -182,44 +202,3 @@ def _double_atan2(y: jax.Array, x: jax.Array) -> jax.Array:
     radius = jnp.sqrt(x * x + y * y)
     away = (y * jnp.cos(rough) - x * jnp.sin(rough)) / jnp.where(radius > 0.0, radius, 1.0)
     return rough + away
-
-
-# --- what ONNX says of its own operations
-
-
-def attributes_of(node: Any) -> dict[str, Any]:
-    """:return: of one operation, by name"""
-    from onnx import helper
-
-    found = {part.name: helper.get_attribute_value(part) for part in node.attribute}
-    return {k: v.decode() if isinstance(v, bytes) else v for k, v in found.items()}
-
-
-def numpy_type(kind: int) -> Any:
-    """:return: the type of NumPy of a type of ONNX"""
-    from onnx import helper
-
-    return helper.tensor_dtype_to_np_dtype(kind)
-
-
-def evaluated(node: Any, given: Sequence[np.ndarray], opset: Sequence[Any]) -> list[Any]:
-    """:return: what an operation does to these arrays, by ONNX's own reference"""
-    from onnx import TensorProto, helper
-    from onnx.reference import ReferenceEvaluator
-
-    names = [f"x{i}" for i in range(len(given))]
-    copy = type(node)()
-    copy.CopyFrom(node)
-    filled = iter(names)
-    inputs = [next(filled) if name else "" for name in node.input]
-    del copy.input[:]
-    copy.input.extend(inputs)
-    kind = TensorProto.INT64
-    graph = helper.make_graph(
-        [copy],
-        "one",
-        [helper.make_tensor_value_info(name, kind, None) for name in names],
-        [helper.make_tensor_value_info(name, kind, None) for name in node.output],
-    )
-    model = helper.make_model(graph, opset_imports=opset)
-    return ReferenceEvaluator(model).run(None, dict(zip(names, given, strict=True)))  # type: ignore[return-value]

@@ -126,9 +126,7 @@ def export_onnx(
                 "of JAX only, and this one is of torch: export with layers=False, and wrap the "
                 "environment where the file runs."
             )
-        from sb3_hds.deploy.torch_policy import module_of
-
-        proto = from_torch(module_of(policy, inputs, plan.by), inputs, outputs)
+        proto = from_torch(policy, inputs, outputs, plan.by)
     else:
         inlined = bool(plan.memory) or not hasattr(policy, "policy_function")
         computed = partial(compute, plan, tuple(ports))

@@ -1,5 +1,6 @@
 """What an exported file says of itself."""
 
+import contextlib
 import hashlib
 import json
 import math
@@ -11,8 +12,8 @@ import jax
 import numpy as np
 from gymnasium import spaces
 
-from sb3_hds.deploy.conversion import OPSET, Port
-from sb3_hds.deploy.observations import WHOLE, parts_of
+from sb3_hds.deploy.conversion import OPSET
+from sb3_hds.deploy.observations import WHOLE, Port, parts_of
 from sb3_hds.deploy.onnx_policy import METADATA, VERSION
 from sb3_hds.deploy.plan import Plan
 from sb3_hds.errors import ExportError, SB3HDSError
@@ -20,7 +21,6 @@ from sb3_hds.errors import ExportError, SB3HDSError
 _VERSIONS = ("sb3-hds", "jax", "flax", "torch", "stable-baselines3", "sbx-rl", "jax2onnx", "onnx")
 
 
-# --- what the file says of itself
 def metadata_of(
     plan: Plan,
     model: Any,
@@ -85,15 +85,14 @@ def _named(
             names, units = [f"action[{i}]" for i in range(n)], [""] * n
             if twin is not None and len(twin.actuators) == n:
                 names, units = [a.name for a in twin.actuators], [a.unit for a in twin.actuators]
-            ends = zip(names, units, space.low.ravel(), space.high.ravel(), strict=True)
+            ends = (
+                [float(x) if math.isfinite(x) else None for x in end.ravel()]
+                for end in (space.low, space.high)
+            )
+            columns = zip(names, units, *ends, strict=True)
             return channels, [
-                {
-                    "name": name,
-                    "unit": unit,
-                    "low": _finite(float(low)),
-                    "high": _finite(float(high)),
-                }
-                for name, unit, low, high in ends
+                dict(zip(("name", "unit", "low", "high"), column, strict=True))
+                for column in columns
             ]
         case spaces.Discrete():
             return channels, [{"name": "action", "n": int(space.n), "start": int(space.start)}]
@@ -101,10 +100,6 @@ def _named(
             counts = enumerate(space.nvec.ravel())
             return channels, [{"name": f"action[{i}]", "n": int(n), "start": 0} for i, n in counts]
     raise ExportError(f"Actions of this kind cannot be exported: {space}.")
-
-
-def _finite(limit: float) -> float | None:
-    return limit if math.isfinite(limit) else None
 
 
 def _twin(model: Any, env: gymnasium.Env | None) -> Any:
@@ -158,10 +153,9 @@ def _versions() -> dict[str, str]:
 
     found = {}
     for name in _VERSIONS:
-        try:
+        # A checkout on the path has no version, nor does a library that is not installed.
+        with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:  # a checkout on the path, or a library that is not used
-            continue
     return found
 
 

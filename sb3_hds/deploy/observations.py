@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 
-from sb3_hds.deploy.conversion import Port
 from sb3_hds.errors import ExportError
 
 # Where an entry of an observation has no limits, or wider ones: it is drawn from a Gaussian.
@@ -18,6 +17,19 @@ OBSERVATION = "observation"
 
 #: name of an observation that is no dictionary
 WHOLE = ""
+
+
+class Port(NamedTuple):
+    """
+    An input or an output.
+
+    :param shape: without the axis of the batch
+    :param dtype: as NumPy names it
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
 
 
 class Normalization(NamedTuple):

@@ -14,6 +14,13 @@ from sb3_hds.errors import ExportError
 METADATA = "sb3_hds.policy"
 VERSION = 1
 
+_DTYPES = {
+    "tensor(float)": np.float32,
+    "tensor(double)": np.float64,
+    "tensor(int64)": np.int64,
+    "tensor(int32)": np.int32,
+}
+
 State = tuple[np.ndarray, ...]
 
 
@@ -54,17 +61,13 @@ class OnnxPolicy:
         text = self._session.get_modelmeta().custom_metadata_map.get(METADATA)
         #: what the file says of itself: names, units, bounds, versions
         self.metadata: Mapping[str, Any] = _metadata(text, name)
-        self._dtypes = {port.name: _dtype(port.type) for port in self._session.get_inputs()}
+        self._dtypes = {port.name: _DTYPES[port.type] for port in self._session.get_inputs()}
         self._shapes = {port.name: port.shape[1:] for port in self._session.get_inputs()}
         self._memory = self.metadata["memory"]
-        self._keys = {
-            name: name.partition(".")[2] for name in self._dtypes if name in self._observations()
-        }
+        observed = self.metadata["observations"]
+        self._keys = {name: name.partition(".")[2] for name in self._dtypes if name in observed}
         self._outputs = ["action", *(part["output"] for part in self._memory)]
         self._discrete = self.metadata["actions"][0].get("n") is not None
-
-    def _observations(self) -> Mapping[str, Any]:
-        return self.metadata["observations"]
 
     @property
     def dt(self) -> float | None:
@@ -74,7 +77,7 @@ class OnnxPolicy:
     @property
     def observation_names(self) -> list[str]:
         """Of the entries of an observation, in the order of the inputs."""
-        return [c["name"] for channels in self._observations().values() for c in channels]
+        return [c["name"] for channels in self.metadata["observations"].values() for c in channels]
 
     @property
     def action_names(self) -> list[str]:
@@ -177,12 +180,3 @@ def _metadata(text: str | None, name: str) -> dict[str, Any]:
             f"{name} is of version {version}, this sb3_hds reads up to {VERSION}. Upgrade sb3_hds."
         )
     return found
-
-
-def _dtype(kind: str) -> type:
-    return {
-        "tensor(float)": np.float32,
-        "tensor(double)": np.float64,
-        "tensor(int64)": np.int64,
-        "tensor(int32)": np.int32,
-    }[kind]

@@ -12,10 +12,10 @@ from gymnasium import spaces
 
 from sb3_hds.core import Signals
 from sb3_hds.core.transforms.base import StatefulTransform
-from sb3_hds.deploy.conversion import Port
 from sb3_hds.deploy.observations import (
     WHOLE,
     Normalization,
+    Port,
     flat,
     normalized,
     observation_ports,
@@ -189,17 +189,14 @@ def compute(plan: Plan, names: tuple[str, ...], *inputs: Any) -> tuple[Any, ...]
 
 
 def _in_units(action: Any, space: spaces.Space, squashed: bool) -> Any:
+    action = action.reshape(-1, *space.shape)  # type: ignore[misc]
     if not isinstance(space, spaces.Box):
-        return action.reshape(-1, *space.shape)  # type: ignore[misc]
+        return action
     low, high = space.low, space.high
-    action = action.reshape(-1, *space.shape)
     if squashed:
         action = low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
-    return jnp.clip(action, low, high) if _limited(space) else action
-
-
-def _limited(space: spaces.Box) -> bool:
-    return bool(np.isfinite(space.low).any() or np.isfinite(space.high).any())
+    limited = np.isfinite(low).any() or np.isfinite(high).any()
+    return jnp.clip(action, low, high) if limited else action
 
 
 def command_of(layer: Layer, action: Any, obs: Any, memory: Any, *joints: Any) -> tuple[Any, Any]:
