@@ -23,7 +23,7 @@ from sb3_hds.wrappers import (
     Phase,
     SharedControlTemplate,
 )
-from sb3_hds.wrappers.safety.projection import nearest
+from sb3_hds.wrappers.safety.shield import nearest
 
 PHASES = [
     {

@@ -12,8 +12,8 @@ from gymnasium import spaces
 
 from sb3_hds.deploy.onnx_policy import OnnxPolicy
 from sb3_hds.errors import ExportError
-from sb3_hds.wrappers.hardware.real_time import RealTime, Timing
-from sb3_hds.wrappers.hardware.record import Record
+from sb3_hds.wrappers.real_time import RealTime, Timing
+from sb3_hds.wrappers.record import Record
 
 # Columns of the bars of a histogram.
 _WIDTH = 40

@@ -27,7 +27,7 @@ from sb3_hds.experiments.returns import returns_of
 from sb3_hds.sysid import Diagnosis
 from sb3_hds.sysid.reporting.figures import as_png, plot_policy_gain
 from sb3_hds.sysid.reporting.wording import policy_in_words
-from sb3_hds.wrappers.episodes.step_limit import step_limit_of
+from sb3_hds.wrappers.episodes import step_limit_of
 
 _N_RESAMPLES = 2000
 _LEVEL = 0.9

@@ -18,7 +18,7 @@ from sb3_hds.algos import OpenLoop
 from sb3_hds.errors import EnvironmentMismatchError, TrajectoryError
 from sb3_hds.experiments.returns import FIRST_START
 from sb3_hds.wrappers import Perturb
-from sb3_hds.wrappers.episodes.step_limit import step_limit_of
+from sb3_hds.wrappers.episodes import step_limit_of
 
 #: arguments of :class:`~sb3_hds.wrappers.Perturb` by the name that a table shows
 PERTURBATIONS: dict[str, dict[str, Any]] = {

@@ -9,24 +9,27 @@ from typing import TYPE_CHECKING
 from sb3_hds.lazy import lazily
 
 if TYPE_CHECKING:
-    from sb3_hds.wrappers.actions.continuity import ContinuityCost
     from sb3_hds.wrappers.actions.cpg_prior import CPGPrior
-    from sb3_hds.wrappers.actions.filters import ActionDelay, ActionRateLimit, LowPassAction
     from sb3_hds.wrappers.actions.scale import ActionScale
+    from sb3_hds.wrappers.actions.transforms import (
+        ActionDelay,
+        ActionRateLimit,
+        ContinuityCost,
+        HistoryObservation,
+        LowPassAction,
+    )
     from sb3_hds.wrappers.checks.task import TaskReport, check_task
     from sb3_hds.wrappers.checks.truncation import TruncationReport, check_truncation
-    from sb3_hds.wrappers.episodes.ends import (
+    from sb3_hds.wrappers.episodes import (
         InfiniteHorizon,
+        ManualReset,
         TerminateToTruncate,
         TruncateToTerminate,
     )
-    from sb3_hds.wrappers.episodes.manual_reset import ManualReset
-    from sb3_hds.wrappers.hardware.perturb import Perturb
-    from sb3_hds.wrappers.hardware.real_time import RealTime, Timing
-    from sb3_hds.wrappers.hardware.record import Record
-    from sb3_hds.wrappers.observations.history import HistoryObservation
-    from sb3_hds.wrappers.observations.show_joints import ShowJoints
-    from sb3_hds.wrappers.observations.time_aware import TimeAware
+    from sb3_hds.wrappers.observations import ShowJoints, TimeAware
+    from sb3_hds.wrappers.perturb import Perturb
+    from sb3_hds.wrappers.real_time import RealTime, Timing
+    from sb3_hds.wrappers.record import Record
     from sb3_hds.wrappers.safety.barrier import JointLimitBarrier
     from sb3_hds.wrappers.safety.shared_control import Phase, SharedControlTemplate
     from sb3_hds.wrappers.safety.shield import ActionShield
@@ -64,20 +67,27 @@ __all__ = [
 lazily(
     __name__,
     {
-        "actions.continuity": ("ContinuityCost",),
         "actions.cpg_prior": ("CPGPrior",),
-        "actions.filters": ("ActionDelay", "ActionRateLimit", "LowPassAction"),
         "actions.scale": ("ActionScale",),
+        "actions.transforms": (
+            "ActionDelay",
+            "ActionRateLimit",
+            "ContinuityCost",
+            "HistoryObservation",
+            "LowPassAction",
+        ),
         "checks.task": ("TaskReport", "check_task"),
         "checks.truncation": ("TruncationReport", "check_truncation"),
-        "episodes.ends": ("InfiniteHorizon", "TerminateToTruncate", "TruncateToTerminate"),
-        "episodes.manual_reset": ("ManualReset",),
-        "hardware.perturb": ("Perturb",),
-        "hardware.real_time": ("RealTime", "Timing"),
-        "hardware.record": ("Record",),
-        "observations.history": ("HistoryObservation",),
-        "observations.show_joints": ("ShowJoints",),
-        "observations.time_aware": ("TimeAware",),
+        "episodes": (
+            "InfiniteHorizon",
+            "ManualReset",
+            "TerminateToTruncate",
+            "TruncateToTerminate",
+        ),
+        "observations": ("ShowJoints", "TimeAware"),
+        "perturb": ("Perturb",),
+        "real_time": ("RealTime", "Timing"),
+        "record": ("Record",),
         "safety.barrier": ("JointLimitBarrier",),
         "safety.shared_control": ("Phase", "SharedControlTemplate"),
         "safety.shield": ("ActionShield",),

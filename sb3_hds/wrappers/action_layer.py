@@ -2,7 +2,6 @@
 
 import abc
 import inspect
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import gymnasium
@@ -12,6 +11,7 @@ from gymnasium import spaces
 from sb3_hds.core import Actuator, Channel, Signals
 from sb3_hds.core.transforms.base import StatefulTransform
 from sb3_hds.errors import ParameterError
+from sb3_hds.wrappers.observations import extended_box, is_vector
 
 _STORES = ("raw", "executed")
 
@@ -33,8 +33,8 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
 
     :param env: its actions are a bounded Box with one axis
     :param store: ``"raw"``, or ``"executed"``
-    :param arguments: of the constructor, recorded in ``env.spec`` so that the wrapper can be
-        rebuilt
+    :param arguments: the other arguments of the constructor, recorded in ``env.spec`` so that the
+        wrapper can be rebuilt
     :raises ParameterError: for other actions, or another ``store``
     """
 
@@ -43,8 +43,8 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
     #: what ``store`` may be
     stores: ClassVar[tuple[str, ...]] = _STORES
 
-    def __init__(self, env: gymnasium.Env, store: str, arguments: Mapping[str, Any]) -> None:
-        gymnasium.utils.RecordConstructorArgs.__init__(self, **arguments)
+    def __init__(self, env: gymnasium.Env, store: str, **arguments: Any) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(self, store=store, **arguments)
         gymnasium.Wrapper.__init__(self, env)
         check_bounded(type(self), env.action_space)
         if store not in self.stores:
@@ -163,9 +163,9 @@ class TransformLayer(ActionLayer):
         env: gymnasium.Env,
         transform: StatefulTransform,
         store: str,
-        arguments: Mapping[str, Any],
+        **arguments: Any,
     ) -> None:
-        super().__init__(env, store, arguments)
+        super().__init__(env, store, **arguments)
         self._transform = transform
         self._below = signals_of(env)
         remembered = transform.remembers(self._below)
@@ -213,8 +213,7 @@ class TransformLayer(ActionLayer):
 
 def check_bounded(layer: type, space: spaces.Space) -> None:
     """:raises ParameterError: unless actions are a bounded Box with one axis"""
-    fine = isinstance(space, spaces.Box) and len(space.shape) == 1 and space.is_bounded()
-    if not fine:
+    if not (is_vector(space) and space.is_bounded()):
         raise ParameterError(
             f"{layer.__name__} takes environments whose actions are a bounded Box with one axis, "
             f"got {space}. Flatten them, or give them limits, below this wrapper."
@@ -244,7 +243,7 @@ def signals_of(env: gymnasium.Env) -> Signals:
     space, seen = env.action_space, env.observation_space
     assert isinstance(space, spaces.Box)
     actuators = tuple(Actuator(f"action[{i}]", "1", *e) for i, e in enumerate(_ends(space)))
-    ends = _ends(seen) if isinstance(seen, spaces.Box) and is_vector(seen) else []
+    ends = _ends(seen) if is_vector(seen) else []
     channels = tuple(Channel(f"obs[{i}]", "1", *e) for i, e in enumerate(ends))
     return Signals(actuators, channels)
 
@@ -256,22 +255,14 @@ def with_channels(
     :return: the observation space with ``added`` appended
     :raises ParameterError: unless observations are a Box with one axis
     """
-    if not isinstance(space, spaces.Box) or not is_vector(space):
+    if not is_vector(space):
         switch = "observe_state" in inspect.signature(type(env).__init__).parameters
         or_else = ", or pass observe_state=False: then the task is no longer Markov" * switch
         raise ParameterError(
             f"{type(env).__name__} adds to observations that are a Box with one axis, got {space}. "
             f"Flatten them below (gymnasium.wrappers.FlattenObservation){or_else}."
         )
-    dtype = np.result_type(space.dtype, np.float32) if space.dtype.kind == "f" else np.float32
-    low = np.concatenate([space.low, [c.low for c in added]]).astype(dtype)
-    high = np.concatenate([space.high, [c.high for c in added]]).astype(dtype)
-    return spaces.Box(low, high, dtype=dtype)
-
-
-def is_vector(space: spaces.Space) -> bool:
-    """:return: whether it is a Box with one axis"""
-    return isinstance(space, spaces.Box) and len(space.shape) == 1
+    return extended_box(space, [c.low for c in added], [c.high for c in added])
 
 
 def _ends(space: spaces.Box) -> list[tuple[float, float]]:

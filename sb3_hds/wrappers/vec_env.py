@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
@@ -226,7 +227,7 @@ class GymnasiumVecEnv(VecEnv):
         copies = self.env.unwrapped
         if not isinstance(copies, SyncVectorEnv):
             return [False for _ in self._which(indices)]
-        return [_is_wrapped(copies.envs[i], wrapper_class) for i in self._which(indices)]
+        return [is_wrapped(copies.envs[i], wrapper_class) for i in self._which(indices)]
 
     def _which(self, indices: VecEnvIndices) -> list[int]:
         return list(self._get_indices(indices))
@@ -292,15 +293,6 @@ def _options_of(options: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
             "Pass set_options() one dictionary."
         )
     return dict(options[0]) or None
-
-
-def _is_wrapped(env: gymnasium.Env, wrapper_class: type[gymnasium.Wrapper]) -> bool:
-    layer = env
-    while isinstance(layer, gymnasium.Wrapper):
-        if isinstance(layer, wrapper_class):
-            return True
-        layer = layer.env
-    return False
 
 
 def infos_of(infos: Mapping[str, Any] | Sequence[Mapping[str, Any]], n: int) -> list[dict]:

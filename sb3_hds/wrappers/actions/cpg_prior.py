@@ -107,14 +107,6 @@ class CPGPrior(TransformLayer):
             "position": position,
             "velocity": velocity,
         }
-        arguments = passed_on | {
-            "omega_swing": omega_swing,
-            "omega_stance": omega_stance,
-            "control": control,
-            "dt": dt,
-            "observe_state": observe_state,
-            "store": store,
-        }
         check_bounded(type(self), env.action_space)
         n = spaces.flatdim(env.action_space)
         self._joints = _tracked(env, control, n, bool(position))
@@ -126,7 +118,17 @@ class CPGPrior(TransformLayer):
             **passed_on,
         )
         self.rhythm = rhythm.sized(n)
-        super().__init__(env, self.rhythm, store, arguments)
+        super().__init__(
+            env,
+            self.rhythm,
+            store,
+            omega_swing=omega_swing,
+            omega_stance=omega_stance,
+            control=control,
+            dt=dt,
+            observe_state=observe_state,
+            **passed_on,
+        )
         self.action_space = spaces.Box(-1.0, 1.0, (self.rhythm.n_actions,), np.float32)
         self._target = self._command = np.zeros(n)
 

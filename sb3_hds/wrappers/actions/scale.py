@@ -49,21 +49,22 @@ class ActionScale(TransformLayer):
                 f"ActionScale takes either a scale or a schedule, got scale={scale} and "
                 f"schedule={schedule}."
             )
-        arguments = {
-            "scale": scale,
-            "schedule": schedule,
-            "axes": axes,
-            "progress": progress,
-            "observe_state": observe_state,
-            "store": store,
-        }
         if not 0.0 <= progress <= 1.0:
             raise ParameterError(f"ActionScale(progress={progress}): progress is from 0 to 1.")
         if axes is not None and np.ndim(axes) != 1:
             raise ParameterError(f"ActionScale(axes={axes!r}): axes is a list of numbers: [0].")
         points = [[0.0, scale]] if schedule is None else schedule
         self._scale = Scale(schedule=_pairs(points), axes=axes, observed=observe_state)
-        super().__init__(env, self._scale, store, arguments)
+        super().__init__(
+            env,
+            self._scale,
+            store,
+            scale=scale,
+            schedule=schedule,
+            axes=axes,
+            progress=progress,
+            observe_state=observe_state,
+        )
         self._begin_at = self._memory
         self.set_progress(progress)
         self._share = self._shares()

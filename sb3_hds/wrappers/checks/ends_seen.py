@@ -8,6 +8,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_hds.wrappers.vec_env import obs_of
+
 #: Ends after which nothing new is expected.
 ENOUGH = 20
 
@@ -69,14 +71,14 @@ def ends_of_vec_env(env: VecEnv, n_steps: int, seed: int) -> Seen:
     while taken < n_steps and len(ends) < ENOUGH:
         taken += env.num_envs
         for i, trace in enumerate(traces):
-            trace[-1].append(_flat(env.observation_space, _row(obs, i)))
+            trace[-1].append(_flat(env.observation_space, obs_of(obs, i)))
         actions = np.stack([space.sample() for _ in range(env.num_envs)])
         obs, _, dones, infos = env.step(actions)
         lengths += 1
         for i in np.flatnonzero(dones).tolist():
             info = dict(infos[i])
             cut, last = bool(info.get("TimeLimit.truncated")), info.get("terminal_observation")
-            ends.append(End(int(lengths[i]), not cut, info, last, _row(obs, i)))
+            ends.append(End(int(lengths[i]), not cut, info, last, obs_of(obs, i)))
             lengths[i] = 0
             traces[i].append([])
     return Seen(ends, taken, _is_clock([one for trace in traces for one in trace]))
@@ -94,12 +96,6 @@ def _drawing(space: spaces.Space, seed: int) -> spaces.Space:
     drawing = copy.deepcopy(space)
     drawing.seed(seed)
     return drawing
-
-
-def _row(obs: Any, i: int) -> Any:
-    if isinstance(obs, dict):
-        return {name: np.array(part[i]) for name, part in obs.items()}
-    return np.array(obs[i])
 
 
 def _flat(space: spaces.Space, obs: Any) -> np.ndarray:

@@ -75,7 +75,6 @@ class JointLimitBarrier(TransformLayer):
             "tolerance": tolerance,
             "dt": dt,
             "on_breach": on_breach,
-            "store": store,
         }
         refuse_layers_below(type(self), env)
         self._on_breach = check_on_breach(type(self), on_breach)
@@ -93,7 +92,7 @@ class JointLimitBarrier(TransformLayer):
             tolerance=_number("tolerance", tolerance),
             dt=interval_of(env, ParameterError) if dt is None else float(dt),
         )
-        super().__init__(env, self._barrier, store, arguments)
+        super().__init__(env, self._barrier, store, **arguments)
         self._turns = np.array([not isinstance(place, int) for place in self._barrier.position])
         self._missed = 0.0
 

@@ -1,7 +1,9 @@
 """Shared control templates: a task in phases, each with few inputs and its own constraints."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium
@@ -10,10 +12,11 @@ from gymnasium import spaces
 
 from sb3_hds.core import Channel
 from sb3_hds.errors import ParameterError, SafetyError
-from sb3_hds.wrappers.action_layer import ActionLayer, is_vector, with_channels
+from sb3_hds.wrappers.action_layer import ActionLayer, with_channels
 from sb3_hds.wrappers.by_name import function_of
+from sb3_hds.wrappers.observations import is_vector
 from sb3_hds.wrappers.safety.barrier import refuse_layers_below
-from sb3_hds.wrappers.safety.projection import Constraints, ConstraintSet, condition_of, nearest
+from sb3_hds.wrappers.safety.shield import Constraints, ConstraintSet, nearest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,9 +76,8 @@ class SharedControlTemplate(ActionLayer):
         observe_state: bool = True,
         store: str = "raw",
     ) -> None:
-        arguments = {"phases": phases, "observe_state": observe_state, "store": store}
         refuse_layers_below(type(self), env)
-        super().__init__(env, store, arguments)
+        super().__init__(env, store, phases=phases, observe_state=observe_state)
         self.phases = [_phase_of(phase) for phase in phases]
         self._observes, self._index, self._seen = observe_state, 0, None
         self._violated = 0.0
@@ -189,7 +191,7 @@ class _Compiled:
             self.constraints = ConstraintSet(label, phase.constraints, self._n)
             self._refuse_what_nothing_satisfies(env.action_space)
         seen = env.observation_space
-        n_obs = seen.shape[0] if isinstance(seen, spaces.Box) and is_vector(seen) else 0
+        n_obs = seen.shape[0] if is_vector(seen) else 0
         for transition in phase.transitions:
             if not isinstance(transition, Mapping) or set(transition) != {"to", "when"}:
                 raise ParameterError(
@@ -202,7 +204,7 @@ class _Compiled:
                 f"Phase '{phase.name}' leads to {unknown}, but there are: {list(phases)}."
             )
         self.transitions = [
-            (condition_of(t["when"], n_obs), phases[t["to"]]) for t in phase.transitions
+            (_condition_of(t["when"], n_obs), phases[t["to"]]) for t in phase.transitions
         ]
 
     def _refuse_what_nothing_satisfies(self, commands: spaces.Space) -> None:
@@ -231,3 +233,27 @@ class _Compiled:
                 f"{matrix!r}."
             )
         return found
+
+
+def _condition_of(given: Any, n_obs: int) -> Callable[[Any], Any]:
+    """
+    :param given: a function of the observation, its name, or ``{"channel": 0, "above": 0.5}`` with
+        ``above``, ``below`` or both
+    :raises ParameterError: for anything else
+    """
+    if isinstance(given, str):
+        return function_of(given)
+    if not isinstance(given, Mapping) and callable(given):
+        return given
+    known = isinstance(given, Mapping) and {"channel"} < set(given) <= {"channel", "above", "below"}
+    if not known or given["channel"] not in range(n_obs):
+        raise ParameterError(
+            "A condition is a function of the observation, its name, or {'channel': INDEX, "
+            f"'above': VALUE}} (or 'below') with an index below {n_obs}; got {given!r}."
+        )
+    low, high = float(given.get("above", -math.inf)), float(given.get("below", math.inf))
+    return functools.partial(_is_between, channel=given["channel"], low=low, high=high)
+
+
+def _is_between(obs: Any, channel: int, low: float, high: float) -> bool:
+    return bool(low < obs[channel] < high)

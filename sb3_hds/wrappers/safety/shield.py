@@ -1,8 +1,9 @@
 """A shield: commands are projected onto coupled linear constraints."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
+import daqp
 import gymnasium
 import numpy as np
 
@@ -10,10 +11,23 @@ from sb3_hds.errors import ParameterError, SafetyError
 from sb3_hds.wrappers.action_layer import ActionLayer
 from sb3_hds.wrappers.by_name import function_of
 from sb3_hds.wrappers.safety.barrier import check_on_breach, refuse_layers_below, report_breach
-from sb3_hds.wrappers.safety.projection import Constraints, ConstraintSet, nearest
 
+#: ``(G, h)`` with ``G u <= h``; or a function of the observation that returns them; or its name
+Constraints: TypeAlias = (
+    tuple[Sequence[Sequence[float]], Sequence[float]]
+    | Callable[[np.ndarray], tuple[Any, Any]]
+    | str
+)
+
+# What rounding a command to single precision can move it, as a share of its largest value.
+_COMMAND_ROUNDING = 1.2e-7
+# More than any constraint asks for: what DAQP takes for no bound.
+_NO_BOUND = -1e30
+# By how much DAQP may miss a constraint whose coefficients have length one, as a share of the
+# largest command, or of the bound if that is more.
+_MISS = 1e-5
 # How far a guard may be below zero because of single precision, without being a breach.
-_ROUNDING = 1e-5
+_GUARD_ROUNDING = 1e-5
 
 
 class ActionShield(ActionLayer):
@@ -60,15 +74,15 @@ class ActionShield(ActionLayer):
         on_breach: str = "raise",
         store: str = "raw",
     ) -> None:
-        arguments = {
-            "constraints": constraints,
-            "guard": guard,
-            "fallback": fallback,
-            "on_breach": on_breach,
-            "store": store,
-        }
         refuse_layers_below(type(self), env)
-        super().__init__(env, store, arguments)
+        super().__init__(
+            env,
+            store,
+            constraints=constraints,
+            guard=guard,
+            fallback=fallback,
+            on_breach=on_breach,
+        )
         self._low, self._high = (x.astype(float) for x in (self.commands.low, self.commands.high))
         self._constraints = ConstraintSet(type(self).__name__, constraints, self._low.size)
         self._guard = function_of(guard) if isinstance(guard, str) else guard
@@ -116,7 +130,7 @@ class ActionShield(ActionLayer):
         if self._guard is None:
             return
         self._margins = np.atleast_1d(np.asarray(self._guard(obs), float))
-        if not np.all(self._margins >= -_ROUNDING):
+        if not np.all(self._margins >= -_GUARD_ROUNDING):
             report_breach(
                 self._on_breach,
                 f"What ActionShield guards is {self._margins.min():.3g}, below zero, at the "
@@ -131,3 +145,91 @@ class ActionShield(ActionLayer):
         if not self.commands.contains(command.astype(self.commands.dtype)):
             raise ParameterError(f"fallback must be a command within {self.commands}: {fallback}.")
         return command
+
+
+def nearest(
+    wanted: np.ndarray, G: np.ndarray, h: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray | None:
+    r"""
+    .. math:: \min_u |u - u_\text{wanted}|^2 \quad \text{s.t.}\quad G u \le h,\ l \le u \le r
+
+    by the dual active-set method of DAQP, which is exact after finitely many steps. Constraints are
+    tightened by what rounding to single precision can take, so two of them that leave a single
+    value count as contradictory.
+
+    Source: Arnström, Bemporad and Axehill, *A dual active-set solver for embedded quadratic
+    programming using recursive LDL updates*, IEEE Transactions on Automatic Control 67(8), 2022.
+
+    :param wanted: shape ``(n,)``
+    :param G: shape ``(m, n)``; constraints mean the same whatever a row is multiplied by
+    :param h: shape ``(m,)``
+    :return: the command, shape ``(n,)``, or None where no command is allowed
+    """
+    wanted, largest = np.clip(wanted, low, high), np.maximum(np.abs(low), np.abs(high))
+    length = np.linalg.norm(G, axis=1)
+    if np.any(h[length == 0.0] < 0.0):
+        return None
+    kept, unit = length > 0.0, largest.max() or 1.0
+    G = G[kept] / length[kept, None]
+    # In units of the largest command from here on, as DAQP's tolerances are absolute.
+    h = h[kept] / (length[kept] * unit)
+    wanted, low, high, largest = (x / unit for x in (wanted, low, high, largest))
+    tight = h - _COMMAND_ROUNDING * (np.abs(G) @ largest)
+    if np.all(G @ wanted <= tight):
+        return wanted * unit
+    n, m = len(wanted), len(h)
+    found, _, flag, _ = daqp.solve(
+        np.eye(n),
+        -wanted,
+        np.ascontiguousarray(G, float),
+        np.concatenate([high, tight]).astype(float),
+        np.concatenate([low, np.full(m, _NO_BOUND)]).astype(float),
+        np.zeros(n + m, np.int32),
+    )
+    found = np.clip(found, low, high)
+    kept_to = np.all(G @ found <= h + _MISS * np.maximum(1.0, np.abs(h)))
+    return found * unit if flag > 0 and kept_to else None
+
+
+class ConstraintSet:
+    """
+    Linear constraints on commands, constant or a function of the observation.
+
+    :param layer: name of the layer, for messages
+    :param given: see :data:`Constraints`
+    :param n: size of a command
+    :raises ParameterError: for anything else, or a constant pair of the wrong shape
+    """
+
+    def __init__(self, layer: str, given: Any, n: int) -> None:
+        self._layer, self._n = layer, n
+        self._function = function_of(given) if isinstance(given, str) else given
+        self._constant: tuple[np.ndarray, np.ndarray] | None = None
+        if not callable(self._function):
+            self._constant = self._checked(given, ParameterError)
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether they are the same for every observation."""
+        return self._constant is not None
+
+    def at(self, obs: Any) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :return: ``G`` of shape ``(m, n)`` and ``h`` of shape ``(m,)``
+        :raises ValueError: if the function returns anything else
+        """
+        return self._constant or self._checked(self._function(obs), ValueError)
+
+    def _checked(self, pair: Any, error: type[Exception]) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            G, h = (np.asarray(part, float) for part in pair)
+        except (TypeError, ValueError):
+            G = h = np.empty(())
+        shaped = G.ndim == 2 and h.ndim == 1 and G.shape == (len(h), self._n)
+        if not shaped or not (np.isfinite(G).all() and np.isfinite(h).all()):
+            raise error(
+                f"{self._layer} takes constraints (G, h) with G u <= h, finite, G of shape "
+                f"(m, {self._n}) and h of shape (m,), or a function of the observation that "
+                f"returns them, or its name 'package.module.function'; got {pair!r}."
+            )
+        return G, h

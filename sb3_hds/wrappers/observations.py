@@ -1,13 +1,15 @@
-"""The remaining time in the observation."""
+"""Wrappers that add to what the policy observes, and the spaces that they make."""
 
-from typing import Any
+from typing import Any, TypeGuard
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import ArrayLike
 
-from sb3_hds.errors import ParameterError
-from sb3_hds.wrappers.episodes.step_limit import chosen_limit
+from sb3_hds.errors import EnvironmentMismatchError, ParameterError
+from sb3_hds.wrappers.actuated_joints import joints_of
+from sb3_hds.wrappers.episodes import chosen_limit
 
 _KEY = "remaining_time"
 
@@ -58,17 +60,50 @@ class TimeAware(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
 def _with_time(space: spaces.Space) -> spaces.Space:
     if isinstance(space, spaces.Dict) and _KEY not in space.spaces:
         return spaces.Dict({**space.spaces, _KEY: spaces.Box(0.0, 1.0, (1,), np.float32)})
-    if not _is_row(space):
+    if not is_vector(space) or space.dtype.kind != "f":
         raise ParameterError(
             f"TimeAware takes observations that are a Box of floats with one axis, or a Dict "
             f"without '{_KEY}', got {space}. Flatten them first: "
             "gymnasium.wrappers.FlattenObservation."
         )
-    low, high = np.append(space.low, 0.0), np.append(space.high, 1.0)  # type: ignore[attr-defined]
-    return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype)  # type: ignore[arg-type]
+    return extended_box(space, [0.0], [1.0])
 
 
-def _is_row(space: spaces.Space) -> bool:
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        return False
-    return np.issubdtype(space.dtype, np.floating)
+class ShowJoints(gymnasium.ObservationWrapper, gymnasium.utils.RecordConstructorArgs):
+    """
+    Appends position and velocity of every joint that is driven, in the order of the actuators
+    [rad or m, rad/s or m/s], so that a policy can track them wherever it acts.
+
+    :param env: of MuJoCo, with observations that are a Box with one axis
+    :raises EnvironmentMismatchError: for another environment
+    """
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(self)
+        gymnasium.ObservationWrapper.__init__(self, env)
+        found, space = joints_of(env), env.observation_space
+        if found is None or not is_vector(space):
+            raise EnvironmentMismatchError(
+                f"ShowJoints needs an environment of MuJoCo whose observations are a Box with one "
+                f"axis, got {env} with {space}."
+            )
+        self._joints = found
+        unlimited = np.full(2 * len(found.names), np.inf)
+        self.observation_space = extended_box(space, -unlimited, unlimited)
+
+    def observation(self, observation: Any) -> np.ndarray:
+        inner: Any = self.env.unwrapped
+        seen = np.concatenate([observation, *self._joints.of_state(inner.state_vector())])
+        return seen.astype(self.observation_space.dtype)
+
+
+def is_vector(space: spaces.Space) -> TypeGuard[spaces.Box]:
+    """:return: whether it is a Box with one axis"""
+    return isinstance(space, spaces.Box) and len(space.shape) == 1
+
+
+def extended_box(space: spaces.Box, low: ArrayLike, high: ArrayLike) -> spaces.Box:
+    """:return: a box with one axis, extended by entries with these limits, in floating point"""
+    dtype = np.result_type(space.dtype, np.float32) if space.dtype.kind == "f" else np.float32
+    lows, highs = np.append(space.low, low), np.append(space.high, high)
+    return spaces.Box(lows.astype(dtype), highs.astype(dtype), dtype=dtype)  # type: ignore[arg-type]

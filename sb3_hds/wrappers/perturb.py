@@ -4,10 +4,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError
+from sb3_hds.wrappers.observations import is_vector
 
 _FAILURES = (None, "zero", "constant")
 # Of MuJoCo's bodies, 0 is the world and 1 the torso.
@@ -43,18 +43,18 @@ class Perturb(gymnasium.Wrapper, RecordConstructorArgs):
         push: float = 0.0,
         push_probability: float = 0.05,
     ) -> None:
-        given = {
-            "noise": noise,
-            "failing": failing,
-            "sensor": sensor,
-            "constant": constant,
-            "push": push,
-            "push_probability": push_probability,
-        }
-        RecordConstructorArgs.__init__(self, **given)
+        RecordConstructorArgs.__init__(
+            self,
+            noise=noise,
+            failing=failing,
+            sensor=sensor,
+            constant=constant,
+            push=push,
+            push_probability=push_probability,
+        )
         gymnasium.Wrapper.__init__(self, env)
         space = env.observation_space
-        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        if not is_vector(space):
             raise EnvironmentMismatchError(f"Perturb takes a Box with one axis, got {space}.")
         in_range = 0.0 <= noise < np.inf and 0.0 <= push_probability <= 1.0
         if failing not in _FAILURES or not in_range or not np.isfinite([constant, push]).all():

@@ -1,13 +1,13 @@
-"""Filters of commands: low-pass, delay, rate limit."""
+"""Filters of commands, a cost on jumps of the action, and histories in the observation."""
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 
-from sb3_hds.core import Delay, LowPass, RateLimit
+from sb3_hds.core import Continuity, Delay, History, LowPass, RateLimit
 from sb3_hds.core.transforms.filters import LOWEST_CUTOFF
 from sb3_hds.errors import ParameterError
 from sb3_hds.wrappers.action_layer import TransformLayer
@@ -61,15 +61,10 @@ class LowPassAction(TransformLayer):
                 f"LowPassAction(order={order!r}): order must be a whole number from 1 to "
                 f"{_HIGHEST_ORDER}."
             )
-        arguments = {
-            "cutoff": cutoff,
-            "order": order,
-            "dt": dt,
-            "observe_state": observe_state,
-            "store": store,
-        }
         transform = LowPass(cutoff=cutoff * interval, order=order, observed=observe_state)
-        super().__init__(env, transform, store, arguments)
+        super().__init__(
+            env, transform, store, cutoff=cutoff, order=order, dt=dt, observe_state=observe_state
+        )
 
 
 class ActionDelay(TransformLayer):
@@ -91,8 +86,8 @@ class ActionDelay(TransformLayer):
     def __init__(
         self, env: gymnasium.Env, steps: int, *, observe_state: bool = True, store: str = "raw"
     ) -> None:
-        arguments = {"steps": steps, "observe_state": observe_state, "store": store}
-        super().__init__(env, Delay(steps=steps, observed=observe_state), store, arguments)
+        transform = Delay(steps=steps, observed=observe_state)
+        super().__init__(env, transform, store, steps=steps, observe_state=observe_state)
 
 
 class ActionRateLimit(TransformLayer):
@@ -123,12 +118,63 @@ class ActionRateLimit(TransformLayer):
                 f"ActionRateLimit(max_rate={max_rate}): max_rate must be above 0, in units of the "
                 "action per second, one number or one for each."
             )
-        most = (rates * interval).tolist()
-        arguments = {
-            "max_rate": max_rate,
-            "dt": dt,
-            "observe_state": observe_state,
-            "store": store,
-        }
-        transform = RateLimit(max_change=most, observed=observe_state)
-        super().__init__(env, transform, store, arguments)
+        transform = RateLimit(max_change=(rates * interval).tolist(), observed=observe_state)
+        super().__init__(
+            env, transform, store, max_rate=max_rate, dt=dt, observe_state=observe_state
+        )
+
+
+class ContinuityCost(TransformLayer):
+    """
+    Subtracts ``weight`` times the squared change of the action from the reward. Actions pass
+    unchanged; the last one is appended to observations, so that the task stays Markov.
+
+    ``info["continuity_cost"]`` is the penalty.
+
+    :param env: its actions are a bounded Box with one axis
+    :param weight: [reward / command unit squared], at least 0
+    :param observe_state: whether the last action is appended; without it, the task is not Markov
+    :param store: as in the other layers
+    :raises ParameterError: for a weight that is negative or not finite
+    """
+
+    alters_commands: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        weight: float,
+        *,
+        observe_state: bool = True,
+        store: str = "raw",
+    ) -> None:
+        transform = Continuity(weight=float(weight), observed=observe_state)
+        super().__init__(env, transform, store, weight=weight, observe_state=observe_state)
+
+    def extra_info(self) -> dict[str, Any]:
+        return {"continuity_cost": self.charged()}
+
+
+class HistoryObservation(TransformLayer):
+    """
+    Appends the last observations and actions to observations, the latest first; zeros before an
+    episode. Actions are those that the policy chose here: outside other layers, the raw ones.
+
+    :param env: observes a Box with one axis, takes a bounded one
+    :param n_observations: observations before the present one
+    :param n_actions: actions before the one that is to be chosen
+    :raises ParameterError: unless both are whole numbers of at least 0, and one is positive
+    """
+
+    alters_commands: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        n_observations: int = 1,
+        n_actions: int = 1,
+        *,
+        store: str = "raw",
+    ) -> None:
+        transform = History(n_observations=n_observations, n_actions=n_actions)
+        super().__init__(env, transform, store, n_observations=n_observations, n_actions=n_actions)

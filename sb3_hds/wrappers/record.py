@@ -11,6 +11,7 @@ from gymnasium import spaces
 from sb3_hds.data.recording import Recorder
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.wrappers.interval import interval_of
+from sb3_hds.wrappers.observations import is_vector
 
 
 class Record(gymnasium.Wrapper):
@@ -78,7 +79,7 @@ class Record(gymnasium.Wrapper):
 
 def _names(kind: str, space: spaces.Space, names: Sequence[str] | None) -> Sequence[str]:
     single = isinstance(space, spaces.Discrete) and kind == "action"
-    if not single and not (isinstance(space, spaces.Box) and len(space.shape) == 1):
+    if not single and not is_vector(space):
         raise TrajectoryError(
             f"Record takes observations and actions that are boxes of one axis, got the {kind} "
             f"space {space}. Flatten it first: gymnasium.wrappers.FlattenObservation."
