@@ -54,8 +54,7 @@ LIBRARIES = {
     "experiments": LEARNING | TABLES | {"scipy", "jinja2", "rliable", "ray"},
     "cli": LEARNING | TABLES,
     "rl_zoo_plugin": {"rl_zoo3", "optuna"},
-    "rl_zoo_plugin/checkpoints.py": {"stable_baselines3", "numpy"},
-    "rl_zoo_plugin/trial_progress.py": {"stable_baselines3"},
+    "rl_zoo_plugin/callbacks.py": {"stable_baselines3", "numpy"},
 }
 """What a layer, or one file of it, imports from outside; the standard library is free."""
 

@@ -188,7 +188,7 @@ class Manager:
 
 @each(
     ({"show_progress": True}, "stable_baselines3.common.callbacks.ProgressBarCallback"),
-    ({"show_progress": True, "n_jobs": 2}, "rl_zoo_plugin.trial_progress.TrialProgress"),
+    ({"show_progress": True, "n_jobs": 2}, "rl_zoo_plugin.callbacks.TrialProgress"),
 )
 def test_trials_of_ours_know_their_steps_and_show_where_they_are(given, shown, monkeypatch):
     manager = type("Manager", (Manager,), dict(vars(Manager)))
