@@ -1,7 +1,8 @@
 """
-Gymnasium wrappers for learning on robots, in rooms by what they act on.
+Gymnasium wrappers for learning on robots.
 
-Names are imported on first use: a loop on a robot needs few of them, and neither JAX nor PyTorch.
+Names are imported on first use: a control loop on a robot needs few of them, and neither JAX nor
+PyTorch.
 """
 
 from typing import TYPE_CHECKING

@@ -21,8 +21,8 @@ def function_of(name: str) -> Callable[..., Any]:
 def imported(name: str, kind: str) -> Any:
     """
     :param name: ``"package.module.Name"``
-    :param kind: what it should be, for the message
-    :raises ParameterError: if there is nothing of that name
+    :param kind: of object, for the message
+    :raises ParameterError: if nothing of that name can be imported
     """
     module, _, attribute = name.rpartition(".")
     try:

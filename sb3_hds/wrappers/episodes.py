@@ -17,11 +17,11 @@ Step = tuple[Any, Any, bool, bool, dict[str, Any]]
 
 class TerminateToTruncate(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """
-    Turns every end into a truncation, so that learners bootstrap the value of the last state.
+    Reports terminations as truncations, so that learners bootstrap the value of the last state.
 
-    For environments that end for a reason that is not part of the task: an operator, a workspace
-    that was left, a limit that is signalled as termination. Rewards are left alone, so where an end
-    means failure, the reward must say so, or the learner sees nothing wrong with it.
+    For environments that end for a reason outside the task: an operator, leaving the workspace, a
+    step limit reported as termination. Rewards are unchanged, so if an end means failure, the
+    reward must show it; otherwise, the learner cannot know.
 
     :param env: of any kind
     """
@@ -31,21 +31,20 @@ class TerminateToTruncate(gymnasium.Wrapper, gymnasium.utils.RecordConstructorAr
         gymnasium.Wrapper.__init__(self, env)
 
     def step(self, action: Any) -> Step:
-        """:return: as the environment, with ``info["was_terminated"]`` where it said so"""
+        """:return: as the environment, with ``info["was_terminated"]`` if it terminated"""
         obs, reward, terminated, truncated, info = self.env.step(action)
         if terminated:
-            return obs, reward, False, True, _told(info, "was_terminated", truncated=True)
+            return obs, reward, False, True, _marked(info, "was_terminated", truncated=True)
         return obs, reward, False, truncated, info
 
 
 class TruncateToTerminate(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     r"""
-    Turns every end into a termination: the value of the last state is 0.
+    Reports truncations as terminations: the value of the last state is 0.
 
-    For a task that really is over after its time, such as "as far as possible in ten seconds".
-    Values are then functions of time, so add :class:`~sb3_hds.wrappers.TimeAware` outside. Without
-    it, one observation has as many values :math:`\sum_{k<n} \gamma^k r` as there are steps
-    :math:`n` left.
+    For a task with a genuine time limit, such as "as far as possible in ten seconds". Values then
+    depend on time, so add :class:`~sb3_hds.wrappers.TimeAware` outside. Without it, the value of an
+    observation is ambiguous: :math:`\sum_{k<n} \gamma^k r` with :math:`n` steps remaining.
 
     Source: Pardo et al., *Time Limits in Reinforcement Learning*, ICML 2018, section 3
     ("time-awareness").
@@ -58,41 +57,41 @@ class TruncateToTerminate(gymnasium.Wrapper, gymnasium.utils.RecordConstructorAr
         gymnasium.Wrapper.__init__(self, env)
 
     def step(self, action: Any) -> Step:
-        """:return: as the environment, with ``info["was_truncated"]`` where a limit ended it"""
+        """:return: as the environment, with ``info["was_truncated"]`` if a limit ended it"""
         obs, reward, terminated, truncated, info = self.env.step(action)
         if truncated and not terminated:
-            return obs, reward, True, False, _told(info, "was_truncated", truncated=False)
+            return obs, reward, True, False, _marked(info, "was_truncated", truncated=False)
         return obs, reward, terminated, False, info
 
 
 class InfiniteHorizon(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """
-    A task without a time limit: after ``max_episode_steps`` an episode is truncated, not
-    terminated.
+    An infinite-horizon task in finite episodes: after ``max_episode_steps`` an episode is
+    truncated, not terminated.
 
-    Ends before the limit, such as a fall, stay what they are. For environments that count their
-    steps themselves and call the last one a termination, and for those that have no limit: a robot
-    that walks for ever still has to be put back sometimes. A failure in the very step of the limit
-    cannot be distinguished from the limit, and counts as the limit.
+    Ends before the limit, such as a fall, are unchanged. For environments that count their steps
+    and report the last one as a termination, and for those without a limit: a robot that could walk
+    for ever still has to be reset from time to time. A failure in the very step of the limit cannot
+    be distinguished from the limit, and counts as the limit.
 
     Source: Pardo et al., *Time Limits in Reinforcement Learning*, ICML 2018, section 4
     ("partial-episode bootstrapping").
 
     :param env: of any kind
     :param max_episode_steps: None: the environment's own limit
-    :raises ParameterError: for no positive whole number, or where the environment has no limit
+    :raises ParameterError: unless it is a positive integer, or if the environment has no limit
     """
 
     def __init__(self, env: gymnasium.Env, max_episode_steps: int | None = None) -> None:
         gymnasium.utils.RecordConstructorArgs.__init__(self, max_episode_steps=max_episode_steps)
         gymnasium.Wrapper.__init__(self, env)
-        # As Gymnasium's TimeLimit calls it: who looks for limits finds both.
+        # The name that Gymnasium's TimeLimit uses, so that a search for limits finds both.
         self._max_episode_steps = chosen_limit("InfiniteHorizon", env, max_episode_steps)
         self._elapsed = 0
 
     @property
     def max_episode_steps(self) -> int:
-        """After how many steps an episode is cut."""
+        """Steps after which an episode is truncated."""
         return self._max_episode_steps
 
     def reset(
@@ -102,28 +101,27 @@ class InfiniteHorizon(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> Step:
-        """:return: as the environment, with ``info["was_terminated"]`` where the limit was one"""
+        """:return: as the environment, with ``info["was_terminated"]`` if it did at the limit"""
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._elapsed += 1
         if self._elapsed < self.max_episode_steps:
             return obs, reward, terminated, truncated, info
         if terminated:
-            info = _told(info, "was_terminated", truncated=True)
+            info = _marked(info, "was_terminated", truncated=True)
         return obs, reward, False, True, info
 
 
 class ManualReset(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """
-    Ends an episode when asked to: with a key, a foot switch, or from another thread.
+    Ends an episode on request: with a key, a foot switch, or from another thread.
 
-    The step during which the request comes is truncated, not terminated, because the task is not
-    over. Observations, actions and rewards are
-    left alone.
+    The step during which the request arrives is truncated, not terminated, because the task is not
+    over. Observations, actions and rewards are unchanged.
 
     :param env: of any kind
-    :param wanted: asked after every step whether to end, or its name ``"package.module.function"``;
-        default: only :meth:`request` ends. In ``env.spec``, a name is remembered and a function is
-        not: it may be one that no other process has.
+    :param wanted: function that is called after every step and returns whether to end, or its name
+        ``"package.module.function"``; default: only :meth:`request` ends. ``env.spec`` records a
+        name, but not a function, which other processes may lack.
     :raises ParameterError: if there is no function of that name
     """
 
@@ -135,7 +133,7 @@ class ManualReset(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self._requested = threading.Event()
 
     def request(self) -> None:
-        """End the episode with the step that is running, or the next one. Any thread may call."""
+        """End the episode with the current or the next step. Any thread may call this."""
         self._requested.set()
 
     def reset(
@@ -145,7 +143,7 @@ class ManualReset(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> Step:
-        """:return: as the environment, with ``info["manual_reset"]`` where it was asked to end"""
+        """:return: as the environment, with ``info["manual_reset"]`` if an end was requested"""
         obs, reward, terminated, truncated, info = self.env.step(action)
         if self._requested.is_set() or (self._wanted is not None and self._wanted()):
             self._requested.clear()
@@ -160,18 +158,18 @@ class ManualReset(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self._requested = threading.Event()
 
 
-def _told(info: dict[str, Any], name: str, truncated: bool) -> dict[str, Any]:
-    """:return: with the old flag of rl_zoo3's ``TimeLimit``, where it is there, set right"""
-    marked = info | {name: True}
-    if "TimeLimit.truncated" in marked:
-        marked["TimeLimit.truncated"] = truncated
-    return marked
+def _marked(info: dict[str, Any], name: str, truncated: bool) -> dict[str, Any]:
+    """:return: with this entry, and the flag of rl_zoo3's ``TimeLimit`` corrected, if present"""
+    info = info | {name: True}
+    if "TimeLimit.truncated" in info:
+        info["TimeLimit.truncated"] = truncated
+    return info
 
 
 class Limit(NamedTuple):
     """
-    :param layer: class of the wrapper that has it
-    :param steps: after which that cuts an episode
+    :param layer: class of the wrapper
+    :param steps: after which it truncates an episode
     """
 
     layer: str
@@ -182,7 +180,7 @@ class Limit(NamedTuple):
 
 
 def limits_of(env: gymnasium.Env) -> list[Limit]:
-    """:return: of each wrapper with one (``TimeLimit``, ``InfiniteHorizon``), outermost first"""
+    """:return: the limits of all wrappers (``TimeLimit``, ``InfiniteHorizon``), outermost first"""
     layer, limits = env, []
     while isinstance(layer, gymnasium.Wrapper):
         limits += own_limit(layer, "_max_episode_steps")
@@ -192,8 +190,8 @@ def limits_of(env: gymnasium.Env) -> list[Limit]:
 
 def own_limit(layer: Any, *names: str) -> list[Limit]:
     """
-    :param names: of the attribute that holds it, the first one that is there counts
-    :return: of this layer alone; empty: it has none
+    :param names: of the attribute, the first that exists counts
+    :return: the limit of this layer alone; empty if it has none
     """
     for name in names:
         steps = vars(layer).get(name)
@@ -204,8 +202,8 @@ def own_limit(layer: Any, *names: str) -> list[Limit]:
 
 def step_limit_of(env: gymnasium.Env) -> int | None:
     """
-    :return: the least of all layers (``TimeLimit``, ``InfiniteHorizon``), or without those what the
-        environment is registered with
+    :return: the smallest of all layers (``TimeLimit``, ``InfiniteHorizon``); without any, the
+        registered one
     """
     if limits := limits_of(env):
         return min(limit.steps for limit in limits)
@@ -216,9 +214,9 @@ def step_limit_of(env: gymnasium.Env) -> int | None:
 
 def chosen_limit(wrapper: str, env: gymnasium.Env, max_episode_steps: int | None) -> int:
     """
-    :param wrapper: the name of the wrapper that needs a limit
-    :param max_episode_steps: what it was given; None: the environment's own
-    :raises ParameterError: for no positive whole number, or where the environment has no limit
+    :param wrapper: name of the wrapper that needs a limit
+    :param max_episode_steps: its argument; None: the environment's own limit
+    :raises ParameterError: unless it is a positive integer, or if the environment has no limit
     """
     limit = step_limit_of(env) if max_episode_steps is None else max_episode_steps
     if limit is None:

@@ -21,14 +21,14 @@ class TimeAware(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     A Box gets one more entry, a Dict the key ``"remaining_time"``. For tasks with a
     true time limit, where values depend on the remaining time. To make its end a termination, add
     :class:`~sb3_hds.wrappers.TruncateToTerminate`. The spaces of the wrapped
-    environment are left alone.
+    environment are not changed.
 
     Source: Pardo et al., *Time Limits in Reinforcement Learning*, ICML 2018, section 3.
 
-    :param env: observes a Box of floats with one axis, or a Dict
+    :param env: its observations are a Box of floats with one axis, or a Dict
     :param max_episode_steps: ``n``; None: the environment's own limit
-    :raises ParameterError: for other observations, no positive whole number, or where the
-        environment has no limit
+    :raises ParameterError: for other observations, a limit that is not a positive integer, or an
+        environment without a limit
     """
 
     def __init__(self, env: gymnasium.Env, max_episode_steps: int | None = None) -> None:
@@ -51,10 +51,10 @@ class TimeAware(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return self._seen(obs), reward, terminated, truncated, info
 
     def _seen(self, obs: Any) -> Any:
-        left = max(0.0, 1.0 - self._elapsed / self.max_episode_steps)
+        remaining = max(0.0, 1.0 - self._elapsed / self.max_episode_steps)
         if isinstance(obs, dict):
-            return obs | {_KEY: np.array([left], np.float32)}
-        return np.append(obs, left).astype(self.observation_space.dtype)
+            return obs | {_KEY: np.array([remaining], np.float32)}
+        return np.append(obs, remaining).astype(self.observation_space.dtype)
 
 
 def _with_time(space: spaces.Space) -> spaces.Space:
@@ -71,8 +71,8 @@ def _with_time(space: spaces.Space) -> spaces.Space:
 
 class ShowJoints(gymnasium.ObservationWrapper, gymnasium.utils.RecordConstructorArgs):
     """
-    Appends position and velocity of every joint that is driven, in the order of the actuators
-    [rad or m, rad/s or m/s], so that a policy can track them wherever it acts.
+    Appends position and velocity of every actuated joint, in the order of the actuators [rad or m,
+    rad/s or m/s], so that a policy can track joints without access to the simulator.
 
     :param env: of MuJoCo, with observations that are a Box with one axis
     :raises EnvironmentMismatchError: for another environment

@@ -13,21 +13,21 @@ from sb3_hds.errors import ParameterError
 from sb3_hds.wrappers.action_layer import TransformLayer
 from sb3_hds.wrappers.interval import interval_of
 
-# As many numbers per action are appended to observations.
+# The order is also the number of entries per action that are appended to observations.
 _HIGHEST_ORDER = 8
 
 
 class LowPassAction(TransformLayer):
     """
-    A Butterworth low-pass in front of each command. The filter's state is appended to observations.
+    Butterworth low-pass filter of each command. The filter's state is appended to observations.
 
     From second order on, the filter overshoots a step (4 % at second order); commands are clipped
-    to their limits. Put limits of joints below it: a filter delays what they ask for.
+    to their limits. Apply joint limits below it, since a filter would delay their corrections.
 
     Source: Butterworth, *On the theory of filter amplifiers*, Experimental Wireless 7, 1930;
     bilinear transform as in ``scipy.signal.butter``, see :class:`sb3_hds.core.LowPass`.
 
-    :param env: its actions are a bounded Box with one axis
+    :param env: with a bounded Box of one axis as action space
     :param cutoff: frequency at which half of the power passes [Hz], below half the control rate
     :param order: 1 to 8
     :param dt: control interval [s]; default: the environment's own ``dt`` or ``tau``
@@ -69,11 +69,11 @@ class LowPassAction(TransformLayer):
 
 class ActionDelay(TransformLayer):
     """
-    Delays commands by whole steps. Commands in transit are appended to observations.
+    Delays commands by an integer number of steps. Commands in transit are appended to observations.
 
     Learners store the raw action: the executed one was chosen in an earlier step.
 
-    :param env: its actions are a bounded Box with one axis
+    :param env: with a bounded Box of one axis as action space
     :param steps: length of the delay [control intervals]
     :param observe_state: whether the commands in transit are appended, the oldest first; without
         them, the task is not Markov
@@ -92,9 +92,9 @@ class ActionDelay(TransformLayer):
 
 class ActionRateLimit(TransformLayer):
     """
-    Limits the rate of change of commands. The last command is appended to observations.
+    Limits the rate of change of commands. The previous command is appended to observations.
 
-    :param env: its actions are a bounded Box with one axis
+    :param env: with a bounded Box of one axis as action space
     :param max_rate: [command unit / s], one number or one per action
     :param dt: control interval [s]; default: the environment's own ``dt`` or ``tau``
     :param observe_state: whether the last command is appended; without it, the task is not Markov
@@ -131,10 +131,10 @@ class ContinuityCost(TransformLayer):
 
     ``info["continuity_cost"]`` is the penalty.
 
-    :param env: its actions are a bounded Box with one axis
+    :param env: with a bounded Box of one axis as action space
     :param weight: [reward / command unit squared], at least 0
     :param observe_state: whether the last action is appended; without it, the task is not Markov
-    :param store: as in the other layers
+    :param store: ``"raw"`` or ``"executed"``, which are the same here
     :raises ParameterError: for a weight that is negative or not finite
     """
 
@@ -152,17 +152,17 @@ class ContinuityCost(TransformLayer):
         super().__init__(env, transform, store, weight=weight, observe_state=observe_state)
 
     def extra_info(self) -> dict[str, Any]:
-        return {"continuity_cost": self.charged()}
+        return {"continuity_cost": self.penalty()}
 
 
 class HistoryObservation(TransformLayer):
     """
-    Appends the last observations and actions to observations, the latest first; zeros before an
-    episode. Actions are those that the policy chose here: outside other layers, the raw ones.
+    Appends the previous observations and actions, the latest first; zeros before an episode.
+    Actions are the inputs of this layer: outside other layers, the raw ones.
 
-    :param env: observes a Box with one axis, takes a bounded one
-    :param n_observations: observations before the present one
-    :param n_actions: actions before the one that is to be chosen
+    :param env: its observations are a Box with one axis, its actions a bounded one
+    :param n_observations: number of observations before the current one
+    :param n_actions: number of actions before the next one
     :raises ParameterError: unless both are whole numbers of at least 0, and one is positive
     """
 

@@ -9,12 +9,12 @@ from gymnasium import spaces
 
 from sb3_hds.wrappers.episodes import step_limit_of
 
-# Shares of the variance of rewards.
+# Unexplained share of the variance of rewards that matters, and the reduction that explains it.
 _MATERIAL = 0.02
 _RECOVERED = 0.5
-# Of the variance of the last action, that an observation leaves open where it contains it.
+# Largest unexplained share of the last action's variance, if observations contain it.
 _KNOWN = 0.02
-# Of the variance of rewards: rounding, and the ridge of the regression.
+# Unexplained share of the variance of rewards due to rounding and the ridge penalty.
 _NOTHING = 1e-4
 _FEWEST = 200
 _BLOCKS = 10
@@ -22,7 +22,7 @@ _BLOCKS = 10
 
 class Sample(NamedTuple):
     """
-    Steps one after the other, ``n`` of them.
+    ``n`` consecutive steps.
 
     :param obs: before each step, flat, shape ``(n, n_obs)``; no columns for images
     :param names: of the entries of an observation
@@ -31,8 +31,8 @@ class Sample(NamedTuple):
     :param age: steps since the episode began, shape ``(n,)``
     :param terminated: shape ``(n,)``
     :param truncated: shape ``(n,)``
-    :param success: what ``info["is_success"]`` said, shape ``(n,)``
-    :param limit: steps after which an episode is cut; None: not known
+    :param success: ``info["is_success"]``, shape ``(n,)``
+    :param limit: steps after which an episode is truncated; None: not known
     """
 
     obs: np.ndarray
@@ -51,13 +51,13 @@ class Sample(NamedTuple):
 
     @property
     def lengths(self) -> np.ndarray:
-        """Steps of each episode that came to its end."""
+        """Steps of each complete episode."""
         return self.age[self.ended] + 1
 
 
 def sampled(env: gymnasium.Env, n_steps: int, seed: int) -> Sample:
     """
-    :param seed: of starts and actions; the action space's own generator is left alone
+    :param seed: of initial states and actions; the action space's own generator is not used
     """
     space = copy.deepcopy(env.action_space)
     space.seed(seed)
@@ -80,7 +80,7 @@ def sampled(env: gymnasium.Env, n_steps: int, seed: int) -> Sample:
 
 
 def _numbers(space: spaces.Space, value: Any) -> np.ndarray:
-    """:return: what of it is a number that a network sees as it is; choices and images are not"""
+    """:return: the entries that a network reads as numbers: no choices and no images"""
     if isinstance(space, spaces.Dict):
         return np.concatenate([_numbers(part, value[name]) for name, part in space.items()])
     if not _is_numeric(space):
@@ -104,8 +104,8 @@ def explained_by(sample: Sample) -> tuple[float, float, float] | None:
     """
     Regress rewards on observation and action, then on earlier ones as well.
 
-    :return: unexplained shares of the variance given observation and action, given the last action
-        too, and given the last observation too; None where there is nothing to regress
+    :return: unexplained shares of the variance given observation and action; given also the last
+        action; given also the last observation. None if there is nothing to regress
     """
     later = np.flatnonzero(sample.age > 0)
     reward = sample.rewards[later]
@@ -115,13 +115,13 @@ def explained_by(sample: Sample) -> tuple[float, float, float] | None:
     obs, before = _scaled(sample.obs)[later], _scaled(sample.obs)[later - 1]
     action, last = _scaled(sample.actions)[later], _scaled(sample.actions)[later - 1]
     base = _quadratic(np.hstack([obs, action]))
-    # As far as the observation contains it, the last action is no news.
-    news = np.hstack([last, last**2, last * action])
+    # The part of the last action that the observation contains adds nothing.
+    added = np.hstack([last, last**2, last * action])
     moved = obs - before
     return (
-        _left_open(base, reward),
-        _left_open(np.hstack([base, news]), reward),
-        _left_open(np.hstack([base, moved, moved**2]), reward),
+        _unexplained(base, reward),
+        _unexplained(np.hstack([base, added]), reward),
+        _unexplained(np.hstack([base, moved, moved**2]), reward),
     )
 
 
@@ -129,14 +129,14 @@ def knows_last_action(sample: Sample) -> bool:
     """:return: whether the observation contains every entry of the last action"""
     later = np.flatnonzero(sample.age > 0)
     obs, last = _scaled(sample.obs)[later], sample.actions[later - 1]
-    return all(_left_open(obs, column) < _KNOWN for column in last.T)
+    return all(_unexplained(obs, column) < _KNOWN for column in last.T)
 
 
 def of_action_alone(sample: Sample) -> bool:
     """:return: whether the reward is a quadratic function of the action alone"""
     if len(sample.rewards) < _FEWEST or not sample.actions.shape[1]:
         return False
-    return _left_open(_quadratic(_scaled(sample.actions)), sample.rewards) < _NOTHING
+    return _unexplained(_quadratic(_scaled(sample.actions)), sample.rewards) < _NOTHING
 
 
 def is_missing(before: float, after: float) -> bool:
@@ -144,7 +144,7 @@ def is_missing(before: float, after: float) -> bool:
     return before > _MATERIAL and after < _RECOVERED * before
 
 
-def _left_open(features: np.ndarray, target: np.ndarray) -> float:
+def _unexplained(features: np.ndarray, target: np.ndarray) -> float:
     """Unexplained share of the variance of a ridge regression, cross-validated in blocks."""
     block = np.arange(len(target)) * _BLOCKS // len(target)
     open_, total = 0.0, 0.0

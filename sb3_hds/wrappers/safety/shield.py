@@ -19,14 +19,14 @@ Constraints: TypeAlias = (
     | str
 )
 
-# What rounding a command to single precision can move it, as a share of its largest value.
+# Rounding error of a command in single precision, relative to its largest value.
 _COMMAND_ROUNDING = 1.2e-7
-# More than any constraint asks for: what DAQP takes for no bound.
+# DAQP takes this for no bound.
 _NO_BOUND = -1e30
-# By how much DAQP may miss a constraint whose coefficients have length one, as a share of the
-# largest command, or of the bound if that is more.
-_MISS = 1e-5
-# How far a guard may be below zero because of single precision, without being a breach.
+# Violation by DAQP to accept, of a constraint with coefficients of length one, relative to the
+# largest command, or to the bound if that is larger.
+_VIOLATION = 1e-5
+# Rounding error of a guard in single precision: no violation down to minus this value.
 _GUARD_ROUNDING = 1e-5
 
 
@@ -36,29 +36,29 @@ class ActionShield(ActionLayer):
 
     .. math:: \min_u |u - a|^2 \quad \text{s.t.}\quad G(o)\,u \le h(o),\ u \in \text{Box}
 
-    With :math:`G = -\partial b / \partial q\,\Delta t` and :math:`h = \gamma\, b(o)`, that keeps
-    :math:`b \ge 0` for joints commanded by their speed, exactly where :math:`b` is linear: several
-    limits, walls and joint combinations at once. For limits of single joints,
+    With :math:`G = -\partial b / \partial q\,\Delta t` and :math:`h = \gamma\, b(o)`, this keeps
+    :math:`b \ge 0` for velocity-controlled joints, exactly if :math:`b` is linear: several limits,
+    walls and combinations of joints at once. For limits of single joints,
     :class:`JointLimitBarrier` is the closed form.
 
     Assumes that the constraints are feasible at every observation and sufficient for safety. The
-    first is checked at construction where constraints are constant, and at every step; the second
-    at every reset and step, if a ``guard`` defines safety. It has to be next to the
-    environment: any layer below would change what it decided.
+    first is checked at construction if constraints are constant, and at every step; the second at
+    every reset and step, if a ``guard`` defines safety. The shield must be next to the environment:
+    a layer below it would change its commands.
 
-    ``info["constraint_cost"]`` is how far guards are below zero, summed, or without one, by how
-    much the executed command violates the constraints; ``info["infeasible"]`` is whether no command
-    was allowed.
+    ``info["constraint_cost"]`` is the sum of negative guards, or without a guard, the violation of
+    the constraints by the executed command; ``info["infeasible"]`` is whether no command was
+    allowed.
 
     Source: Ames et al., *Control barrier functions: theory and applications*, ECC 2019, section II.
 
-    :param env: its actions are a bounded Box with one axis
+    :param env: with a bounded Box of one axis as action space
     :param constraints: ``(G, h)``; or a function of the observation that returns them, or its name
         ``"package.module.function"``
-    :param guard: function of the observation that returns what must stay at least 0, shape
-        ``(k,)``; or its name
-    :param fallback: the command where none is allowed, for example the one that stops; None raises
-    :param on_breach: what to do where a guard is negative: ``"raise"``, ``"warn"`` or ``"ignore"``
+    :param guard: function of the observation whose values, shape ``(k,)``, must not be negative; or
+        its name
+    :param fallback: the command if none is allowed, for example the one that stops; None: raise
+    :param on_breach: what to do if a guard is negative: ``"raise"``, ``"warn"`` or ``"ignore"``
     :param store: ``"executed"``: learners store the command
     :raises ParameterError: for constraints of the wrong shape, constant ones that contradict each
         other, or another layer below
@@ -111,13 +111,13 @@ class ActionShield(ActionLayer):
     def begin(self, obs: Any) -> None:
         super().begin(obs)
         self._violated, self._infeasible = 0.0, False
-        self._look(obs)
+        self._check_guard(obs)
 
-    def arrive(self, obs: Any, command: np.ndarray) -> None:
-        super().arrive(obs, command)
+    def observe(self, obs: Any, command: np.ndarray) -> None:
+        super().observe(obs, command)
         G, h = self._constraints.at(self._seen)
         self._violated = float(np.clip(G @ command - h, 0.0, None).sum())
-        self._look(obs)
+        self._check_guard(obs)
 
     def cost(self) -> float:
         return float(-self._margins.clip(None, 0.0).sum()) if self._guard else self._violated
@@ -125,7 +125,7 @@ class ActionShield(ActionLayer):
     def extra_info(self) -> dict[str, Any]:
         return {"infeasible": self._infeasible}
 
-    def _look(self, obs: Any) -> None:
+    def _check_guard(self, obs: Any) -> None:
         self._seen = obs
         if self._guard is None:
             return
@@ -133,8 +133,8 @@ class ActionShield(ActionLayer):
         if not np.all(self._margins >= -_GUARD_ROUNDING):
             report_breach(
                 self._on_breach,
-                f"What ActionShield guards is {self._margins.min():.3g}, below zero, at the "
-                f"observation {obs}: its constraints do not keep it, or the episode began there.",
+                f"The guard of ActionShield is {self._margins.min():.3g}, below zero, at the "
+                f"observation {obs}: the constraints do not ensure it, or the episode began there.",
             )
 
     def _project(self, action: np.ndarray, obs: Any) -> np.ndarray | None:
@@ -154,25 +154,25 @@ def nearest(
     .. math:: \min_u |u - u_\text{wanted}|^2 \quad \text{s.t.}\quad G u \le h,\ l \le u \le r
 
     by the dual active-set method of DAQP, which is exact after finitely many steps. Constraints are
-    tightened by what rounding to single precision can take, so two of them that leave a single
-    value count as contradictory.
+    tightened by the rounding error of single precision, so two that leave a single value count as
+    contradictory.
 
     Source: Arnström, Bemporad and Axehill, *A dual active-set solver for embedded quadratic
     programming using recursive LDL updates*, IEEE Transactions on Automatic Control 67(8), 2022.
 
     :param wanted: shape ``(n,)``
-    :param G: shape ``(m, n)``; constraints mean the same whatever a row is multiplied by
+    :param G: shape ``(m, n)``; the scale of a row and its bound does not matter
     :param h: shape ``(m,)``
-    :return: the command, shape ``(n,)``, or None where no command is allowed
+    :return: the command, shape ``(n,)``; None if no command is allowed
     """
     wanted, largest = np.clip(wanted, low, high), np.maximum(np.abs(low), np.abs(high))
     length = np.linalg.norm(G, axis=1)
     if np.any(h[length == 0.0] < 0.0):
         return None
-    kept, unit = length > 0.0, largest.max() or 1.0
-    G = G[kept] / length[kept, None]
-    # In units of the largest command from here on, as DAQP's tolerances are absolute.
-    h = h[kept] / (length[kept] * unit)
+    nonzero, unit = length > 0.0, largest.max() or 1.0
+    G = G[nonzero] / length[nonzero, None]
+    # In units of the largest command from here on, since DAQP's tolerances are absolute.
+    h = h[nonzero] / (length[nonzero] * unit)
     wanted, low, high, largest = (x / unit for x in (wanted, low, high, largest))
     tight = h - _COMMAND_ROUNDING * (np.abs(G) @ largest)
     if np.all(G @ wanted <= tight):
@@ -187,8 +187,8 @@ def nearest(
         np.zeros(n + m, np.int32),
     )
     found = np.clip(found, low, high)
-    kept_to = np.all(G @ found <= h + _MISS * np.maximum(1.0, np.abs(h)))
-    return found * unit if flag > 0 and kept_to else None
+    feasible = np.all(G @ found <= h + _VIOLATION * np.maximum(1.0, np.abs(h)))
+    return found * unit if flag > 0 and feasible else None
 
 
 class ConstraintSet:
