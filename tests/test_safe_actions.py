@@ -258,7 +258,7 @@ def test_a_joint_that_is_not_commanded_by_its_speed_is_found_out():
     for env in (lagging, exact):
         env.reset(seed=0, options={"q": [0.0]})
     assert exact.step(np.array([0.5], np.float32))[-1]["tracking_error"] < 1e-6
-    with pytest.raises(SafetyError, match="missed what its speed command asks for"):
+    with pytest.raises(SafetyError, match="missed its commanded position"):
         lagging.step(np.array([0.5], np.float32))
 
 

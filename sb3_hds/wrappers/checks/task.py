@@ -133,15 +133,15 @@ def _reward_variety(sample: Sample) -> list[str]:
     if np.ptp(sample.rewards) == 0.0:
         return [
             f"Constant reward: each of {n} steps paid {usual:g}, so all actions are equally good. "
-            "If there is another reward, random actions did not reach it, and a policy will reach it "
+            "If there is another reward, random actions did not reach it, and a policy will do so "
             "by chance only: reward progress towards the goal, or start episodes near it."
         ]
     if of_action_alone(sample):
         return [
             f"Sparse reward: the rewards of {n} random steps depend on the action alone. A policy "
             "learns to minimise the action cost, and nothing about the task, until it finds "
-            "another reward by chance. Reward progress towards the goal, start episodes near it, or "
-            "explore further (gSDE, correlated noise)."
+            "another reward by chance. Reward progress towards the goal, start episodes near it, "
+            "or explore further (gSDE, correlated noise)."
         ]
     n_other = others + int((sample.rewards[sample.terminated] != usual).sum())
     if n_other > _RARE * n:

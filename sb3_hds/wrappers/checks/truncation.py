@@ -17,9 +17,9 @@ from sb3_hds.wrappers.vec_env import GymnasiumVecEnv
 
 # Steps to sample if no limit is known.
 _DEFAULT_STEPS = 2_000
-# Ends after the same number of steps are a limit if there are at least so many, and they are half of
-# all ends, or outnumber those at any length in the last fifth before, and at any other length, by
-# these factors.
+# Ends after the same number of steps are a limit if there are at least so many, and they are half
+# of all ends, or outnumber those of any length in the last fifth before, and of any other length,
+# by these factors.
 _FEWEST = 3
 _THAN_BEFORE, _THAN_ANY = 3.0, 1.5
 # Attributes that hold the limit of a vectorised layer; single environments use the first.
