@@ -17,9 +17,9 @@ from sb3_hds.deploy.c_operations import Translation
 from sb3_hds.deploy.onnx_policy import OnnxPolicy
 from sb3_hds.errors import ExportError
 
-#: calls that are compared, and timed
+#: number of calls that are compared, and timed
 N_CHECKED, N_TIMED = 1_000, 20_000
-#: largest difference to onnxruntime, in halves of the range of each action
+#: largest difference to onnxruntime, relative to half the range of each action
 TOLERANCE = 1e-5
 _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wno-unused-function", "-pedantic", "-Werror")
 
@@ -27,16 +27,16 @@ _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wno-unused-function", "-pedan
 @dataclasses.dataclass(frozen=True)
 class Header:
     """
-    What was written.
+    A C header.
 
     :param path: of the header
-    :param n_bytes: its size as text
-    :param constant_bytes: weights and other constants
-    :param stack_bytes: what one call needs
-    :param n_operations: multiplications, additions and functions of one call
-    :param largest_error: against onnxruntime, in halves of the ranges; None: no compiler was found
-    :param median: of one call on this machine [s]; None likewise
-    :param worst: likewise
+    :param n_bytes: size of its text
+    :param constant_bytes: of weights and other constants
+    :param stack_bytes: used by one call
+    :param n_operations: multiplications, additions and functions in one call
+    :param largest_error: relative to onnxruntime and half the range; None: no compiler was found
+    :param median: time of one call on this machine [s]; None: no compiler was found
+    :param worst: longest time of one call [s]; None: no compiler was found
     """
 
     path: Path
@@ -55,7 +55,7 @@ class Header:
             f"{self.n_operations:,} operations",
         ]
         if self.largest_error is None:
-            lines.append("  not compiled: there is no command cc here")
+            lines.append("  not compiled: there is no command cc")
             return "\n".join(lines)
         assert self.median is not None and self.worst is not None
         lines.append(
@@ -75,16 +75,16 @@ def export_c(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> He
     loops without Python. Where there is a command ``cc``, the header is compiled, compared with
     onnxruntime on 1,000 observations and timed before it is written.
 
-    ``NAME_step(observation, ..., action)`` computes one action, with the memory in a ``NAME_state``
-    that ``NAME_reset`` begins, where there is some; NAME is that of the header. With
-    ``-DNAME_MAIN``, in capitals, there is a ``main`` that reads observations from standard input,
-    and then joints where the policy reads some, and prints actions.
+    ``NAME_step(observation, ..., action)`` computes one action, where NAME is that of the header.
+    Its memory, if any, is in a ``NAME_state`` that ``NAME_reset`` initialises. With
+    ``-DNAME_MAIN``, in capitals, there is a ``main`` that reads observations, and joints if the
+    policy reads some, from standard input and prints actions.
 
     :param source: the ONNX file
-    :param path: of the header; a file of that name is replaced
-    :return: what was written
-    :raises ExportError: for an operation without a translation, or a header that computes something
-        else
+    :param path: of the header; an existing file is replaced
+    :return: the header
+    :raises ExportError: for an operation without a translation, or a header that disagrees with
+        onnxruntime
     :raises ImportError: without the extra ``onnx``
     """
     try:
@@ -110,8 +110,8 @@ def export_c(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> He
         error, median, worst = _checked(compiler, name, text, policy, translation)
         if not error <= TOLERANCE:
             raise ExportError(
-                f"The header would compute something else: actions differ from onnxruntime by "
-                f"{error:.1e} of half their range, and {TOLERANCE:g} is allowed. Nothing was "
+                "The header would not compute what the file does: actions differ from onnxruntime "
+                f"by {error:.1e} of half their range, and {TOLERANCE:g} is allowed. Nothing was "
                 "written."
             )
         header = dataclasses.replace(header, largest_error=error, median=median, worst=worst)
@@ -121,20 +121,20 @@ def export_c(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> He
 
 def _identifier(stem: str) -> str:
     """
-    :raises ExportError: for a name that C does not take
+    :raises ExportError: for a name that is no identifier in C
     """
     found = re.sub(r"\W", "_", stem, flags=re.ASCII)
     if not re.match(r"[A-Za-z_]", found):
         raise ExportError(
-            f"The name of a header becomes that of its functions, and C has no '{stem}': begin it "
-            "with a letter."
+            f"The name of a header becomes that of its functions, and '{stem}' is no name in C: "
+            "begin it with a letter."
         )
     return found
 
 
 def _header(name: str, policy: OnnxPolicy, translation: Translation, source: str) -> str:
-    told, upper = policy.metadata, name.upper()
-    memory = {part["input"]: part for part in told["memory"]}
+    metadata, upper = policy.metadata, name.upper()
+    memory = {part["input"]: part for part in metadata["memory"]}
     own = [port for port in translation.inputs if port not in memory]
     action = translation.outputs["action"]
     state = bool(memory)
@@ -143,16 +143,16 @@ def _header(name: str, policy: OnnxPolicy, translation: Translation, source: str
     arguments = ", ".join([*given, *state_argument, f"{translation.kind(action)} *action"])
     described = [
         f" *   {port}: {translation.size(port)} x {translation.kind(port)}"
-        + _channels(told["observations"].get(port, ()))
+        + _channels(metadata["observations"].get(port, ()))
         for port in own
     ]
     described.append(
         f" *   action: {translation.size(action)} x {translation.kind(action)}"
-        + _channels(told["actions"])
+        + _channels(metadata["actions"])
     )
     lines = [
-        f"/* {told['algorithm']}, from {source}, weights {told['weights_sha256'][:16]}.",
-        f" * A step is {told['dt']} s long." if told["dt"] else " * The step is not known.",
+        f"/* {metadata['algorithm']}, from {source}, weights {metadata['weights_sha256'][:16]}.",
+        f" * A step is {metadata['dt']} s long." if metadata["dt"] else " * The step is not known.",
         *described,
         f" * cc -std=c99 -O2 -D{upper}_MAIN -x c {name}.h -lm -o {name}",
         " */",
@@ -196,8 +196,8 @@ def _header(name: str, policy: OnnxPolicy, translation: Translation, source: str
 
 
 def _channels(channels: Sequence[Mapping[str, Any]]) -> str:
-    told = [f"{c['name']} [{c['unit']}]" if c.get("unit") else c["name"] for c in channels]
-    text = f" ({', '.join(told)})" if told else ""
+    names = [f"{c['name']} [{c['unit']}]" if c.get("unit") else c["name"] for c in channels]
+    text = f" ({', '.join(names)})" if names else ""
     return text.replace("*/", "* /")
 
 
@@ -240,7 +240,7 @@ def _main(
 def _checked(
     compiler: str, name: str, text: str, policy: OnnxPolicy, translation: Translation
 ) -> tuple[float, float, float]:
-    """The largest error, and the median and the worst time of a call [s]."""
+    """The largest error, and the median and the longest time of a call [s]."""
     rng = np.random.default_rng(0)
     memory = {part["input"] for part in policy.metadata["memory"]}
     own = [port for port in translation.inputs if port not in memory]
@@ -277,7 +277,7 @@ def _drawn(policy: OnnxPolicy, port: str, rng: np.random.Generator) -> np.ndarra
 
 
 def _timed(name: str, translation: Translation, own: Sequence[str], state: bool) -> str:
-    """A program that prints the median and the worst time of a call [s]."""
+    """A program that prints the median and the longest time of a call [s]."""
     symbols = [translation.symbol(port) for port in own]
     declared = "".join(
         f"    static {translation.kind(port)} {symbol}[{translation.size(port)}];\n"

@@ -1,4 +1,4 @@
-"""Operations of ONNX as statements of C, for a batch of one, with all shapes known."""
+"""ONNX operations as C statements, for a batch of one and known shapes."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,7 +20,7 @@ from sb3_hds.deploy.c_text import (
 )
 from sb3_hds.errors import ExportError
 
-# What only moves numbers: its effect on their places is found by moving the places themselves.
+# Operations that only move numbers: applied to indices, they show which number goes where.
 _MOVES = {
     "Concat",
     "Expand",
@@ -38,9 +38,11 @@ _MOVES = {
 
 class Translation:
     """
+    The C code of an ONNX model.
+
     :param proto: an ``onnx.ModelProto``
     :param shapes: of its inputs, with a leading axis of one
-    :raises ExportError: for an operation that has no translation
+    :raises ExportError: for an operation without a translation
     """
 
     def __init__(self, proto: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
@@ -49,7 +51,7 @@ class Translation:
 
         self._opset = list(proto.opset_import)
         graph = proto.graph
-        held = {part.name: numpy_helper.to_array(part) for part in graph.initializer}
+        weights = {part.name: numpy_helper.to_array(part) for part in graph.initializer}
         zeros = {
             port.name: np.zeros(
                 shapes[port.name], helper.tensor_dtype_to_np_dtype(port.type.tensor_type.elem_type)
@@ -58,9 +60,9 @@ class Translation:
         }
         with np.errstate(all="ignore"):
             values = ReferenceEvaluator(proto).run(None, zeros, intermediate=True)
-        found: dict[str, Any] = {**held, **zeros, **values}  # type: ignore[dict-item]
+        found: dict[str, Any] = {**weights, **zeros, **values}  # type: ignore[dict-item]
         self._values = {name: np.asarray(value) for name, value in found.items() if name}
-        self._constant = set(held)
+        self._constant = set(weights)
         self.inputs = list(zeros)
         self.outputs = {port.name: port.name for port in graph.output}
         self._symbols: dict[str, str] = {}
@@ -76,14 +78,14 @@ class Translation:
         for node in self._needed(graph):
             self._translate(node)
 
-    # --- what the header asks for
+    # --- parts of the header
 
     def kind(self, name: str) -> str:
-        """:return: the type of C of an array"""
+        """:return: the C type of an array"""
         return KINDS[self._values[name].dtype.name]
 
     def size(self, name: str) -> int:
-        """:return: how many numbers it has"""
+        """:return: its number of elements"""
         return int(self._values[name].size)
 
     def symbol(self, name: str) -> str:
@@ -95,13 +97,13 @@ class Translation:
 
     @property
     def constant_bytes(self) -> int:
-        """Of weights and tables."""
+        """Size of weights and tables."""
         weights = sum(self._values[name].nbytes for name in self._used)
         return int(weights + 4 * sum(table.size for table in self._tables.values()))
 
     @property
     def stack_bytes(self) -> int:
-        """Of all that is computed in a call."""
+        """Size of all buffers of a call."""
         return int(sum(self._values[name].nbytes for name in self._buffers))
 
     def constants(self, prefix: str) -> list[str]:
@@ -128,10 +130,10 @@ class Translation:
         """:return: statements that copy an array"""
         return [f"for (i = 0; i < {self.size(name)}; ++i) {target}[i] = {self._read(name)}[i];"]
 
-    # --- one operation after the other
+    # --- translation of single operations
 
     def _needed(self, graph: Any) -> list[Any]:
-        """The operations that the outputs depend on, in their order; not those on constants."""
+        """The operations that the outputs depend on, in order, without those on constants."""
         wanted, found = {port.name for port in graph.output}, []
         for node in reversed(graph.node):
             if wanted & set(node.output) - self._constant:
@@ -170,12 +172,12 @@ class Translation:
             self._over_last(node, inputs)
         else:
             raise ExportError(
-                f"The operation {kind} of ONNX has no translation to C here. Run the ONNX file "
+                f"The operation {kind} of ONNX has no translation to C. Run the ONNX file "
                 "itself, or use another activation function."
             )
 
     def _read(self, name: str) -> str:
-        """A constant, or a buffer."""
+        """The symbol of a constant or a buffer."""
         name = self._alias.get(name, name)
         if name in self._constant:
             self._used[name] = None
@@ -187,7 +189,7 @@ class Translation:
         return self.symbol(name)
 
     def _index(self, shape: tuple[int, ...], name: str, index: str = "i") -> str:
-        """Where a number of the result finds that of an input, as both are broadcast."""
+        """Index into an input for element ``index`` of the result, under broadcasting."""
         value = self._values[name]
         places = np.arange(value.size).reshape(value.shape)
         table = np.broadcast_to(places, shape).ravel()
@@ -228,7 +230,7 @@ class Translation:
         )
 
     def _folded(self, output: str, first: str, others: Iterable[tuple[str, str]]) -> None:
-        """:param others: inputs, and the expression by which each is added to what is before it"""
+        """:param others: inputs, and the expression that combines each with the result so far"""
         shape = self._values[output].shape
         text = self._at(shape, first)
         for name, expression in others:
@@ -239,7 +241,7 @@ class Translation:
     def _move(self, node: Any, inputs: Sequence[str]) -> None:
         data = inputs if node.op_type == "Concat" else inputs[:1]
         if any(name not in self._constant for name in inputs if name not in data):
-            raise ExportError(f"{node.op_type} by a computed index has no translation to C here.")
+            raise ExportError(f"{node.op_type} by a computed index has no translation to C.")
         first, given = 0, []
         for name in inputs:
             value = self._values[name]
@@ -260,7 +262,7 @@ class Translation:
     def _gather(
         self, output: str, table: np.ndarray, data: Sequence[str], ends: np.ndarray
     ) -> None:
-        """Runs of numbers that stay neighbours are copied by a loop each."""
+        """Copy each run of contiguous elements in a loop."""
         target = self._new(output)
         source = np.searchsorted(ends, table, side="right") - 1
         breaks = np.flatnonzero((np.diff(table) != 1) | (np.diff(source) != 0)) + 1
@@ -289,7 +291,7 @@ class Translation:
         alpha, beta = attributes.get("alpha", 1.0), attributes.get("beta", 1.0)
         bias = inputs[2] if node.op_type == "Gemm" and len(inputs) > 2 else None
         if "." in equation or len(equation.split("->")[0].split(",")) != 2 or alpha != 1.0:
-            raise ExportError(f"{node.op_type} ({equation}) has no translation to C here.")
+            raise ExportError(f"{node.op_type} ({equation}) has no translation to C.")
         self._contraction(output, equation, inputs[:2], bias, beta)
 
     def _contraction(
@@ -333,7 +335,7 @@ class Translation:
         )
 
     def _last(self, node: Any, inputs: Sequence[str]) -> tuple[int, int]:
-        """How many rows, and how long they are, where an operation goes over the last axes."""
+        """Number of rows and their length, for an operation over the last axes."""
         value, attributes = self._values[inputs[0]], _attributes_of(node)
         axes = attributes.get("axes", attributes.get("axis"))
         if len(inputs) > 1:

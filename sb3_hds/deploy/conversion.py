@@ -14,13 +14,13 @@ import torch as th
 from gymnasium import spaces
 from jax.extend.core import Literal
 
-from sb3_hds.deploy.observations import WHOLE, Normalization, Port, parts_of
+from sb3_hds.deploy.observations import SINGLE, Normalization, Port, parts_of
 from sb3_hds.errors import ExportError
 
-#: of the operators, and of the file: onnxruntime 1.14 (February 2023) reads both
+#: versions of operators and file format, which onnxruntime 1.14 (February 2023) reads
 OPSET, IR_VERSION = 18, 8
 BATCH = "batch"
-# Calls whose content is evaluated in their place.
+# Calls to inline.
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 
 
@@ -32,11 +32,11 @@ def from_jax(
     inlined: bool,
 ) -> Any:
     """
-    :param function: of arrays with a leading axis, to a tuple of those
-    :param inlined: whether jax2onnx sees single operations instead of layers of flax, which it
-        writes shorter, but can neither map nor evaluate in double precision
+    :param function: from arrays with a leading axis to a tuple of them
+    :param inlined: whether to convert single operations instead of layers of flax, which are
+        shorter, but support neither ``vmap`` nor double precision
     :return: an ``onnx.ModelProto``
-    :raises ExportError: for an operation that jax2onnx does not know
+    :raises ExportError: for an operation that jax2onnx does not support
     :raises ImportError: without the extra ``onnx``
     """
     try:
@@ -61,8 +61,8 @@ def from_jax(
         except (NotImplementedError, KeyError) as error:
             reason = str(error).strip().partition("\n")[0]
             raise ExportError(
-                f"jax2onnx cannot convert this policy ({reason}). If it has an activation function "
-                "of your own, write it with functions of jax.numpy, or use one of jax.nn."
+                f"jax2onnx cannot convert this policy ({reason}). If it has a custom activation "
+                "function, write it with functions of jax.numpy, or use one of jax.nn."
             ) from error
 
 
@@ -77,7 +77,7 @@ def from_torch(
     :param inputs: one for each part of an observation
     :param by: normalisation of its observations
     :return: an ``onnx.ModelProto``
-    :raises ExportError: for an operation that torch does not export
+    :raises ExportError: for an operation that torch cannot export
     :raises ImportError: without the extra ``onnx``
     """
     try:
@@ -92,7 +92,7 @@ def from_torch(
     file = io.BytesIO()
     with _quiet():
         try:
-            # The exporter that traces: torch.export refuses the checks of torch's distributions.
+            # The tracing exporter: torch.export fails at the checks in torch's distributions.
             th.onnx.export(
                 module.eval(),
                 example,
@@ -123,7 +123,7 @@ class _DeterministicPolicy(th.nn.Module):
     def forward(self, *inputs: th.Tensor) -> th.Tensor:
         """:return: actions in the units of the action space"""
         seen = {key: self._normalized(key, x) for key, x in zip(self.keys, inputs, strict=True)}
-        action = self.policy._predict(seen.get(WHOLE, seen), deterministic=True).reshape(
+        action = self.policy._predict(seen.get(SINGLE, seen), deterministic=True).reshape(
             -1, *self.space.shape
         )
         if not isinstance(self.space, spaces.Box):
@@ -147,7 +147,7 @@ def _missing(name: str) -> ImportError:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Both converters report on standard output and by warnings what only they can change."""
+    """Silence the output and warnings of the converters, on which users cannot act."""
     loggers = [logging.getLogger(name) for name in ("jax2onnx", "onnx_ir", "onnx_ir.serde")]
     before = [logger.level for logger in loggers]
     for logger in loggers:
@@ -169,7 +169,7 @@ def _inlined(function: Callable[..., Any], given: Sequence[Any]) -> Callable[...
 
 def _evaluate(closed: Any, arguments: Sequence[Any]) -> list[Any]:
     """
-    What a traced function computes, in operations that are exact in the file: jax2onnx 0.17
+    Evaluate a traced function by operations that are exact in the file: jax2onnx 0.17
     converts ``rem`` for fixed shapes only (``ir.Shape`` of a symbolic batch, in its
     ``plugins/jax/lax/rem.py``), and onnxruntime has ``Atan`` in single precision only.
     """
@@ -197,8 +197,8 @@ def _evaluate(closed: Any, arguments: Sequence[Any]) -> list[Any]:
 
 
 def _double_atan2(y: jax.Array, x: jax.Array) -> jax.Array:
-    """From single precision by one step of Newton's method, whose error is cubic."""
-    rough = jnp.arctan2(y.astype(jnp.float32), x.astype(jnp.float32)).astype(jnp.float64)
+    """Refine single precision by one step of Newton's method, whose error is cubic."""
+    estimate = jnp.arctan2(y.astype(jnp.float32), x.astype(jnp.float32)).astype(jnp.float64)
     radius = jnp.sqrt(x * x + y * y)
-    away = (y * jnp.cos(rough) - x * jnp.sin(rough)) / jnp.where(radius > 0.0, radius, 1.0)
-    return rough + away
+    error = (y * jnp.cos(estimate) - x * jnp.sin(estimate)) / jnp.where(radius > 0.0, radius, 1.0)
+    return estimate + error

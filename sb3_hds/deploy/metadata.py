@@ -1,4 +1,4 @@
-"""What an exported file says of itself."""
+"""The metadata of an exported file."""
 
 import contextlib
 import hashlib
@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_hds.deploy.conversion import OPSET
-from sb3_hds.deploy.observations import WHOLE, Port, parts_of
+from sb3_hds.deploy.observations import SINGLE, Port, parts_of
 from sb3_hds.deploy.onnx_policy import METADATA, VERSION
 from sb3_hds.deploy.plan import Plan
 from sb3_hds.errors import ExportError, SB3HDSError
@@ -29,7 +29,7 @@ def metadata_of(
     ports: Mapping[str, Port],
     outputs: Sequence[str],
 ) -> dict[str, Any]:
-    channels, actuators = _named(plan, model, env)
+    channels, actuators = _channels_and_actuators(plan, model, env)
     return {
         "version": VERSION,
         "algorithm": type(model).__name__,
@@ -39,8 +39,8 @@ def metadata_of(
             if key in parts_of(plan.stack.observation_space)
         },
         "actions": actuators,
-        "dt": _interval(plan, model, env) if dt is None else float(dt),
-        "inputs": [_spelt(port) for port in ports.values()],
+        "dt": _dt(plan, model, env) if dt is None else float(dt),
+        "inputs": [_described(port) for port in ports.values()],
         "outputs": list(outputs),
         "memory": [
             {
@@ -60,7 +60,7 @@ def metadata_of(
     }
 
 
-def _spelt(port: Port) -> str:
+def _described(port: Port) -> str:
     shape = ", ".join(map(str, ("batch", *port.shape)))
     return f"{port.name} {port.dtype} ({shape})"
 
@@ -71,14 +71,14 @@ def _numbered(key: str, port: Port) -> list[dict[str, str]]:
     return [{"name": name, "unit": ""} for name in names]
 
 
-def _named(
+def _channels_and_actuators(
     plan: Plan, model: Any, env: gymnasium.Env | None
 ) -> tuple[dict[str, list[dict[str, str]]], list[dict[str, Any]]]:
-    """Channels and actuators, with the names and units of the twin where there is one that fits."""
+    """Channels and actuators, with names and units of the twin if there is one that fits."""
     space, twin = plan.stack.action_space, _twin(model, env)
     channels = {}
     if twin is not None and spaces.flatdim(plan.stack.observation_space) == len(twin.channels):
-        channels[WHOLE] = [{"name": c.name, "unit": c.unit} for c in twin.channels]
+        channels[SINGLE] = [{"name": c.name, "unit": c.unit} for c in twin.channels]
     match space:
         case spaces.Box():
             n = spaces.flatdim(space)
@@ -115,7 +115,7 @@ def _twin(model: Any, env: gymnasium.Env | None) -> Any:
         return None
 
 
-def _interval(plan: Plan, model: Any, env: gymnasium.Env | None) -> float | None:
+def _dt(plan: Plan, model: Any, env: gymnasium.Env | None) -> float | None:
     from sb3_hds.wrappers.interval import interval_of
 
     for layer in plan.stack.layers:
@@ -132,7 +132,7 @@ def _interval(plan: Plan, model: Any, env: gymnasium.Env | None) -> float | None
 
 
 def _hash(policy: Any) -> str:
-    """Of all weights, in their order, by name."""
+    """Hash of all weights, ordered by name."""
     found = hashlib.sha256()
     for name, tensor in sorted(_tensors(policy).items()):
         found.update(name.encode())
@@ -160,15 +160,15 @@ def _versions() -> dict[str, str]:
 
 
 def prune(proto: Any) -> None:
-    """Remove constants that no operation reads: runtimes warn of them."""
+    """Remove constants that no operation reads, of which runtimes warn."""
     read = {name for node in proto.graph.node for name in node.input}
     kept = [part for part in proto.graph.initializer if part.name in read]
     del proto.graph.initializer[:]
     proto.graph.initializer.extend(kept)
 
 
-def write_metadata(proto: Any, told: Mapping[str, Any]) -> None:
+def write_metadata(proto: Any, metadata: Mapping[str, Any]) -> None:
     del proto.metadata_props[:]
     entry = proto.metadata_props.add()
-    entry.key, entry.value = METADATA, json.dumps(told)
+    entry.key, entry.value = METADATA, json.dumps(metadata)
     proto.producer_name = "sb3_hds"

@@ -66,7 +66,7 @@ def check_task(
     sample = sampled(env, n_steps, seed)
     subject = (
         f"Task of {name_of(env)}: in {n_steps} random steps and "
-        f"{counted(len(sample.lengths), 'complete episode')}, gamma={gamma:g}"
+        f"{counted(len(sample.lengths), 'full episode')}, gamma={gamma:g}"
     )
     return TaskReport(subject, _findings(env, sample, gamma), [])
 

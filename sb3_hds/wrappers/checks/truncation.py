@@ -140,8 +140,8 @@ def _looks_like_a_limit(seen: Seen, limit: int | None) -> list[str]:
         return []
     return [
         f"{n} of {counted(len(seen.ends), 'episode')} ended as terminations after exactly "
-        f"{longest} steps. That looks like a time limit: the learner will assign the value 0 "
-        "to states that have one. Return truncated=True, terminated=False there, or use "
+        f"{longest} steps. That looks like a time limit: the learner will use 0 as the "
+        "value of states that have another. Return truncated=True, terminated=False there, or use "
         f"sb3_hds.wrappers.InfiniteHorizon(env, max_episode_steps={longest}). If the task "
         "really ends then, add the time to observations: sb3_hds.wrappers.TimeAware."
     ]
