@@ -119,7 +119,7 @@ def test_the_command_takes_what_the_environment_was_made_and_wrapped_with(tmp_pa
     kinds = [row["perturbation"] for row in rows]
     assert kinds == [kind for kind in PERTURBATIONS if kind != "push"]
     # Without the filter, whose state is observed.
-    assert without == 1 and "put the wrappers around it" in capsys.readouterr().err
+    assert without == 1 and "same arguments and wrappers" in capsys.readouterr().err
 
 
 @each(("sbx.SAC", "MlpPolicy"), pytest.param("ppo_lstm", "MlpLstmPolicy", marks=EXPENSIVE))

@@ -117,12 +117,10 @@ class Translation:
 
     def body(self, prefix: str) -> list[str]:
         """:return: the statements of a call"""
-        names = [self.symbol(name) for name in self._used] + list(self._tables)
-        own = {f"@{symbol}@": f"{prefix}_{symbol}" for symbol in names}
         declared = [
             f"{self.kind(name)} {self.symbol(name)}[{self.size(name)}];" for name in self._buffers
         ]
-        statements = [re.sub(r"@\w+@", lambda m: own[m[0]], line) for line in self._statements]
+        statements = [re.sub(r"@(\w+)@", rf"{prefix}_\1", line) for line in self._statements]
         idle = [f"(void){name};" for name in ("i", "j", "k", *map(self.symbol, self.inputs))]
         return ["int i = 0, j = 0, k = 0;", *declared, *idle, *statements]
 
@@ -216,10 +214,7 @@ class Translation:
         shape = self._values[output].shape
         single = all(self._values[name].dtype != np.float64 for name in inputs)
         read = [self._at(shape, name) for name in inputs]
-        text = expression.replace("{f}", "f" if single else "")
-        for i, part in enumerate(read):
-            text = text.replace(f"{{{i}}}", part)
-        self._loop(output, text)
+        self._loop(output, expression.format(*read, f="f" if single else ""))
 
     def _loop(self, output: str, text: str) -> None:
         n = self.size(output)
@@ -234,8 +229,7 @@ class Translation:
         shape = self._values[output].shape
         text = self._at(shape, first)
         for name, expression in others:
-            other = self._at(shape, name)
-            text = "(" + expression.replace("{0}", text).replace("{1}", other) + ")"
+            text = f"({expression.format(text, self._at(shape, name))})"
         self._loop(output, text)
 
     def _move(self, node: Any, inputs: Sequence[str]) -> None:
