@@ -237,17 +237,18 @@ def _wrapped_step(
         if layer.transform.observed:
             seen = {SINGLE: np.concatenate([seen[SINGLE], memory]).astype(np.float32)}
     seen = {key: normalized(values, plan.by.get(key)) for key, values in seen.items()}
+    act = partial(plan.policy.predict, _as_observation(seen), own, start, deterministic=True)
     if plan.function is not None and plan.function.joints is not None:
         states = np.zeros((1, 1 + max(*plan.joints.position, *plan.joints.velocity)))  # type: ignore[union-attr]
-        for places, values in zip(plan.joints, joints, strict=True):  # type: ignore[arg-type]
-            states[:, list(places)] = values
+        for indices, values in zip(plan.joints, joints, strict=True):  # type: ignore[arg-type]
+            states[:, list(indices)] = values
         plan.policy.read_states, before = lambda: states, plan.policy.read_states
         try:
-            action, own = plan.policy.predict(_as_observation(seen), own, start, deterministic=True)
+            action, own = act()
         finally:
             plan.policy.read_states = before
     else:
-        action, own = plan.policy.predict(_as_observation(seen), own, start, deterministic=True)
+        action, own = act()
     after = []
     for layer, obs, memory in zip(plan.stack.layers, below, memories, strict=True):
         read = tuple(np.asarray(joints, float)) if layer.joints else ()

@@ -89,10 +89,9 @@ def _channels_and_actuators(
                 [float(x) if math.isfinite(x) else None for x in end.ravel()]
                 for end in (space.low, space.high)
             )
-            columns = zip(names, units, *ends, strict=True)
             return channels, [
-                dict(zip(("name", "unit", "low", "high"), column, strict=True))
-                for column in columns
+                {"name": name, "unit": unit, "low": low, "high": high}
+                for name, unit, low, high in zip(names, units, *ends, strict=True)
             ]
         case spaces.Discrete():
             return channels, [{"name": "action", "n": int(space.n), "start": int(space.start)}]
