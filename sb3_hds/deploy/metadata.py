@@ -121,7 +121,7 @@ def _dt(plan: Plan, model: Any, env: gymnasium.Env | None) -> float | None:
         if hasattr(layer.transform, "dt"):
             return float(layer.transform.dt)  # type: ignore[attr-defined]
     for holder in (plan.policy, model):
-        inner = getattr(holder, "body", None) or getattr(holder, "twin", None)
+        inner = getattr(holder, "robot", None) or getattr(holder, "twin", None)
         if getattr(inner, "dt", None):
             return float(inner.dt)  # type: ignore[union-attr]
     try:
