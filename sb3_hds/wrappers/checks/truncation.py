@@ -57,8 +57,8 @@ def check_truncation(
     if n_steps is not None and n_steps < 1:
         raise ParameterError(f"check_truncation(n_steps={n_steps}): at least one step is needed.")
     if isinstance(env, VectorEnv):
-        return _of_vector_env(env, n_steps, seed)
-    if isinstance(env, VecEnv):
+        problems, notes, seen = _of_vector_env(env, n_steps, seed)
+    elif isinstance(env, VecEnv):
         problems, notes, seen = _of_vec_env(env, n_steps, seed)
     elif isinstance(env, gymnasium.Env):
         problems, notes, seen = _of_env(env, n_steps, seed)
@@ -100,19 +100,18 @@ def _of_vec_env(env: VecEnv, n_steps: int | None, seed: int) -> tuple[list, list
     return problems, [] if problems else _unseen(seen, limit), seen
 
 
-def _of_vector_env(env: VectorEnv, n_steps: int | None, seed: int) -> TruncationReport:
-    seen = Seen([], 0, False)
+def _of_vector_env(env: VectorEnv, n_steps: int | None, seed: int) -> tuple[list, list, Seen]:
     try:
         adapted = GymnasiumVecEnv(env)
         problems, notes, seen = _of_vec_env(adapted, n_steps, seed)
     except (ParameterError, RuntimeError) as error:
-        return TruncationReport(_subject(env, seen), [str(error)], [])
+        return [str(error)], [], Seen([], 0, False)
     if adapted.autoreset_mode is AutoresetMode.NEXT_STEP:
         notes.append(
             "In NEXT_STEP mode the step after an end ignores the action and is no transition. "
             "GymnasiumVecEnv(env) leaves it out; a learner of your own must, too."
         )
-    return TruncationReport(_subject(env, seen), problems, notes)
+    return problems, notes, seen
 
 
 def _only_in_info(seen: Seen) -> list[str]:
@@ -120,7 +119,7 @@ def _only_in_info(seen: Seen) -> list[str]:
     if not n:
         return []
     return [
-        f"{counted(n, 'time-out')} of {counted(len(seen.ends), 'end')} were reported only in "
+        f"{counted(n, 'time-out')} of {counted(len(seen.ends), 'end')} came only as "
         "info['TimeLimit.truncated'], and step() returned terminated=True. SB3 sets this entry "
         "itself from what step() returns, so the time-out counts as a failure. Return "
         "truncated=True and terminated=False."
