@@ -204,10 +204,10 @@ def _channels(channels: Sequence[Mapping[str, Any]]) -> str:
 def _main(
     name: str, translation: Translation, own: Sequence[str], action: str, state: bool
 ) -> list[str]:
-    upper, whole = name.upper(), translation.kind(action) in ("int", "long long")
+    upper, is_integer = name.upper(), translation.kind(action) in ("int", "long long")
     symbols = [translation.symbol(port) for port in own]
     call = ", ".join([*symbols, *(["&state"] if state else []), "action"])
-    printed = '"%lld%c", (long long)action[i]' if whole else '"%.9g%c", (double)action[i]'
+    printed = '"%lld%c", (long long)action[i]' if is_integer else '"%.9g%c", (double)action[i]'
     lines = [f"#ifdef {upper}_MAIN", "#include <stdio.h>", "", "int main(void) {"]
     lines += [
         f"    static {translation.kind(port)} {translation.symbol(port)}[{translation.size(port)}];"

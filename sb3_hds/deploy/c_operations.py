@@ -247,8 +247,8 @@ class Translation:
         ends = np.cumsum([0, *(self.size(name) for name in data)])
         for output, places in zip(node.output, _evaluated(node, given, self._opset), strict=True):
             table = np.asarray(places).ravel()
-            whole = table.size and np.array_equal(table, np.arange(ends[1]))
-            if whole and len(data) == 1:
+            unchanged = table.size and np.array_equal(table, np.arange(ends[1]))
+            if unchanged and len(data) == 1:
                 self._alias[output] = self._alias.get(data[0], data[0])
                 continue
             self._gather(output, table, data, ends)
@@ -378,7 +378,7 @@ def _evaluated(node: Any, given: Sequence[np.ndarray], opset: Sequence[Any]) -> 
     from onnx import helper
     from onnx.reference import ReferenceEvaluator
 
-    # Each input gets a name of its own: a node may read one array twice.
+    # Each input gets its own name, since a node may read one array twice.
     names = [f"x{i}" if name else "" for i, name in enumerate(node.input)]
     copy = type(node)()
     copy.CopyFrom(node)

@@ -56,7 +56,7 @@ class SharedControlTemplate(ActionLayer):
 
     Source: the idea of shared control templates as in Quere et al., *Shared control templates for
     assistive robotics*, ICRA 2020, and Padalkar et al., *Guiding reinforcement learning with shared
-    control templates*, ICRA 2023; this is a description of its own, for linear constraints.
+    control templates*, ICRA 2023; the formulation here, with linear constraints, is our own.
 
     :param env: its observations are a Box with one axis, its actions a bounded one
     :param phases: :class:`Phase` each, or its arguments; an episode begins in the first
