@@ -12,7 +12,7 @@ from small_models import small
 
 import sb3_hds
 from rl_zoo_plugin import __main__, hook, lazy, samplers, tables, trials
-from rl_zoo_plugin import trial_progress as progress_of_trials
+from rl_zoo_plugin import callbacks
 from rl_zoo_plugin.lazy import LazyAlgorithm
 from rl_zoo_plugin.samplers import SAMPLERS
 from sb3_hds.algos.registry import ALGORITHMS
@@ -159,9 +159,9 @@ def test_a_trial_has_memory_for_its_own_steps_alone():
 
 
 def test_a_trial_says_now_and_then_how_far_it_is(capsys, monkeypatch):
-    monkeypatch.setattr(progress_of_trials, "_EVERY", 0.0)
+    monkeypatch.setattr(callbacks, "_PROGRESS_INTERVAL", 0.0)
     with trials.running(3, 20):
-        progress = progress_of_trials.TrialProgress()
+        progress = callbacks.TrialProgress()
     small("droq", learning_starts=100).learn(25, callback=progress)
     progress.locals["pretraining"] = True
     progress.on_step()
