@@ -11,8 +11,7 @@ from cases import each
 from small_models import small
 
 import sb3_hds
-from rl_zoo_plugin import __main__, hook, lazy, samplers, tables, trials
-from rl_zoo_plugin import callbacks
+from rl_zoo_plugin import __main__, callbacks, hook, lazy, samplers, tables, trials
 from rl_zoo_plugin.lazy import LazyAlgorithm
 from rl_zoo_plugin.samplers import SAMPLERS
 from sb3_hds.algos.registry import ALGORITHMS
