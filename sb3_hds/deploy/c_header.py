@@ -169,7 +169,7 @@ def _header(name: str, policy: OnnxPolicy, translation: Translation, source: str
     if state:
         lines += [
             "typedef struct {",
-            *(f"    {translation.kind(p)} {p}[{translation.size(p)}];" for p in memory),
+            *(f"    {translation.declared(port, port)}" for port in memory),
             f"}} {name}_state;",
             "",
             f"static void {name}_reset({name}_state *state) {{",
@@ -209,11 +209,8 @@ def _main(
     call = ", ".join([*symbols, *(["&state"] if state else []), "action"])
     printed = '"%lld%c", (long long)action[i]' if is_integer else '"%.9g%c", (double)action[i]'
     lines = [f"#ifdef {upper}_MAIN", "#include <stdio.h>", "", "int main(void) {"]
-    lines += [
-        f"    static {translation.kind(port)} {translation.symbol(port)}[{translation.size(port)}];"
-        for port in own
-    ]
-    lines += [f"    {translation.kind(action)} action[{translation.size(action)}];"]
+    lines += [f"    static {translation.declared(port)}" for port in own]
+    lines += [f"    {translation.declared(action, 'action')}"]
     lines += [f"    {name}_state state;", f"    {name}_reset(&state);"] * state
     lines += ["    double number;", "    int i;", "    for (;;) {"]
     for port in own:
@@ -279,11 +276,8 @@ def _drawn(policy: OnnxPolicy, port: str, rng: np.random.Generator) -> np.ndarra
 def _timed(name: str, translation: Translation, own: Sequence[str], state: bool) -> str:
     """A program that prints the median and the longest time of a call [s]."""
     symbols = [translation.symbol(port) for port in own]
-    declared = "".join(
-        f"    static {translation.kind(port)} {symbol}[{translation.size(port)}];\n"
-        for port, symbol in zip(own, symbols, strict=True)
-    )
-    action = translation.kind(translation.outputs["action"])
+    declared = "".join(f"    static {translation.declared(port)}\n" for port in own)
+    action = translation.declared(translation.outputs["action"], "action")
     call = ", ".join([*symbols, *(["&state"] if state else []), "action"])
     return f"""#include <stdio.h>
 #include <stdlib.h>
@@ -295,7 +289,7 @@ static int compare(const void *a, const void *b) {{
 }}
 int main(void) {{
     static double seconds[{N_TIMED}];
-{declared}    static {action} action[{name.upper()}_N_ACTION];
+{declared}    static {action}
     {f"{name}_state state; {name}_reset(&state);" if state else ""}
     struct timespec begin, end;
     int k;

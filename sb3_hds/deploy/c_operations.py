@@ -95,6 +95,10 @@ class Translation:
             return re.sub(r"\W", "_", name, flags=re.ASCII)
         return self._symbols.setdefault(name, f"v{len(self._symbols)}")
 
+    def declared(self, name: str, symbol: str | None = None) -> str:
+        """:return: its declaration in C; default: by its own symbol"""
+        return f"{self.kind(name)} {symbol or self.symbol(name)}[{self.size(name)}];"
+
     @property
     def constant_bytes(self) -> int:
         """Size of weights and tables."""
@@ -117,9 +121,7 @@ class Translation:
 
     def body(self, prefix: str) -> list[str]:
         """:return: the statements of a call"""
-        declared = [
-            f"{self.kind(name)} {self.symbol(name)}[{self.size(name)}];" for name in self._buffers
-        ]
+        declared = map(self.declared, self._buffers)
         statements = [re.sub(r"@(\w+)@", rf"{prefix}_\1", line) for line in self._statements]
         idle = [f"(void){name};" for name in ("i", "j", "k", *map(self.symbol, self.inputs))]
         return ["int i = 0, j = 0, k = 0;", *declared, *idle, *statements]

@@ -10,7 +10,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_hds.errors import ParameterError
-from sb3_hds.wrappers.checks.ends_seen import End, Seen, ends_of_env, ends_of_vec_env, is_same
+from sb3_hds.wrappers.checks.ends_seen import Seen, ends_of_env, ends_of_vec_env, is_same
 from sb3_hds.wrappers.checks.report import Report, counted, name_of
 from sb3_hds.wrappers.episodes import Limit, limits_of, own_limit, step_limit_of
 from sb3_hds.wrappers.vec_env import GymnasiumVecEnv
@@ -222,9 +222,11 @@ def _lost_observations(env: VecEnv, seen: Seen) -> list[str]:
     reported = [end for end in seen.ends if end.last_obs is not None]
     strange = [end for end in reported if not _fits(env, end.last_obs)]
     if strange:
+        last = strange[0].last_obs
+        found = type(last).__name__ if isinstance(last, dict) else f"of shape {np.shape(last)}"
         return [
             f"In {len(strange)} of {counted(len(reported), 'end')}, "
-            f"infos[i]['terminal_observation'] was {_shape(strange[0].last_obs)} instead of one "
+            f"infos[i]['terminal_observation'] was {found} instead of one "
             f"observation of {env.observation_space}. Put the row of that copy there."
         ]
     # If all episodes begin alike, an episode may also end where it began.
@@ -304,14 +306,9 @@ def _fits(env: VecEnv, obs: Any) -> bool:
     return np.shape(obs) == (space.shape or ())
 
 
-def _shape(obs: Any) -> str:
-    return type(obs).__name__ if isinstance(obs, dict) else f"of shape {np.shape(obs)}"
-
-
 def _subject(env: Any, seen: Seen) -> str:
-    ends: list[End] = seen.ends
-    n_cut = sum(not end.terminated for end in ends)
+    n_cut = sum(not end.terminated for end in seen.ends)
     return (
         f"Truncation of {name_of(env)}: in {counted(seen.n_steps, 'step')}, {n_cut} truncated and "
-        f"{counted(len(ends) - n_cut, 'terminated episode')}"
+        f"{counted(len(seen.ends) - n_cut, 'terminated episode')}"
     )
