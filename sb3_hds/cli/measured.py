@@ -92,7 +92,7 @@ def data_of(given: argparse.Namespace, columns: Any) -> "Trajectories":
     from sb3_hds.data.columns import FORM
     from sb3_hds.data.load import WITHOUT_COLUMNS
 
-    files: str | Sequence[str] = given.data[0] if len(given.data) == 1 else given.data
+    files = given.data[0] if len(given.data) == 1 else given.data
     try:
         return Trajectories.load(files, columns=columns)
     except TrajectoryError as error:
