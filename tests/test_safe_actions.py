@@ -310,7 +310,7 @@ FORWARD = {"action_space": spaces.Box(1.0, 5.0, (2,))}
     (ActionShield, {"constraints": ([[1.0, 0.0, 0.0]], [1.0])}, "of shape"),
     (ActionShield, {"constraints": ([[1.0, 0.0], [-1.0, 0.0]], [-1.0] * 2)}, "no command"),
     (ActionShield, {"constraints": "nowhere.at_all"}, "no function"),
-    (SharedControlTemplate, {"phases": [Phase("a", TURN)] * 2}, "names of their own"),
+    (SharedControlTemplate, {"phases": [Phase("a", TURN)] * 2}, "unique names"),
     (SharedControlTemplate, {"phases": [Phase("a", [[1.0]])]}, r"shape \(2, n_inputs\)"),
     (one_phase, {"transitions": [{"to": "b", "when": distances}]}, "leads to"),
     (one_phase, {"transitions": [{"to": "a", "when": {"channel": 9}}]}, "condition"),

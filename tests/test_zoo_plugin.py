@@ -113,7 +113,7 @@ def test_a_trial_is_recreated_exactly_has_arguments_and_steps_left_to_learn_from
         assert sampler.convert(study.trials[-1].params) == sampled
         # The zoo writes them to config.yml, which has to be readable without this package.
         assert yaml.safe_load(yaml.safe_dump(sampled)) == sampled
-        arguments, of_policy = lazy._apart(sampled)
+        arguments, of_policy = lazy._split(sampled)
         assert set(arguments) <= known and set(of_policy) <= of_policies
         n_dropped = sampled.get("top_quantiles_to_drop_per_net", 0)
         assert 0 <= n_dropped < sampled.get("policy_kwargs.n_quantiles", 1 + n_dropped)

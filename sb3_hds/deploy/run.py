@@ -145,8 +145,8 @@ def _check_fits(policy: OnnxPolicy, env: gymnasium.Env) -> None:
         outside = policy.metadata["outside"]
         hint = f" Wrap it as in the training: {', '.join(outside)}." if outside else ""
         raise ExportError(
-            f"The policy has {wanted} inputs and {len(policy.action_names)} commands; the "
-            f"environment has {found} observed numbers and {actions} commands.{hint}"
+            f"The policy takes {wanted} observed numbers and returns {len(policy.action_names)} "
+            f"commands; the environment has {found} and {actions}.{hint}"
         )
 
 

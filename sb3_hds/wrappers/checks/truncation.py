@@ -152,7 +152,10 @@ def _never_acts(stacks: list[list[Limit]], env: Any, seen: Seen) -> list[str]:
     if found:
         outer, inner = found[0]
         where = f" (in {len(found)} of {len(stacks)} copies)" if len(stacks) > 1 else ""
-        what = f"The limit of {outer} never takes effect{where}: {inner} inside it come first."
+        what = (
+            f"The limit of {outer} never takes effect{where}: "
+            f"that of {inner} inside it comes first."
+        )
     else:
         outer = min((stack[0] for stack in stacks if stack), key=_steps_of, default=None)
         cut = Counter(end.length for end in seen.ends if not end.terminated)
