@@ -187,7 +187,7 @@ def test_folders_that_are_taken_are_refused(tmp_path):
     with pytest.raises(StudyError, match="with different steps"):
         run_study(study_of(tmp_path, envs=["Pendulum-v1"], budget={"steps": 500}), folder)
     (tmp_path / "other" / "hds" / "Pendulum-v1_1").mkdir(parents=True)
-    with pytest.raises(StudyError, match="not of a study"):
+    with pytest.raises(StudyError, match="does not belong to a study"):
         run_study(study, tmp_path / "other")
 
 
