@@ -1,1 +1,1 @@
-"""Makes the stock ``rl_zoo3`` command know the algorithms and environments of ``sb3_hds``."""
+"""Registers the algorithms and environments of ``sb3_hds`` with the stock ``rl_zoo3`` command."""

@@ -1,6 +1,6 @@
 """
-``python -m rl_zoo_plugin train --algo hds --env Pendulum-v1``: the zoo's commands, ours included,
-without any help from the start of the interpreter.
+``python -m rl_zoo_plugin train --algo hds --env Pendulum-v1``: the zoo's commands with our
+algorithms, without the hook at the start of the interpreter.
 """
 
 import runpy

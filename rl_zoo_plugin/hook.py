@@ -1,5 +1,5 @@
 """
-An import hook that extends ``rl_zoo3`` in the moment it is imported.
+An import hook that extends ``rl_zoo3`` when it is imported.
 
 ``rl_zoo3`` keeps its algorithms in a module-level dictionary and reads it when a command starts,
 so they have to be there before the command runs any code of ours. ``sb3_hds.pth`` (``.start`` from
@@ -14,7 +14,7 @@ _TARGETS = ("rl_zoo3.utils", "rl_zoo3.hyperparams_opt", "rl_zoo3.exp_manager")
 
 
 class _ZooFinder:
-    """Finds what the other finders find, and has the targets extended once they have run."""
+    """Finds the targets by the other finders, and extends them once they have run."""
 
     def __init__(self):
         self._searching = set()
@@ -22,7 +22,7 @@ class _ZooFinder:
     def find_spec(self, name, path=None, target=None):
         if name not in _TARGETS or name in self._searching:
             return None
-        self._searching.add(name)  # other hooks may ask all finders too, this one included
+        self._searching.add(name)  # other hooks may ask all finders, including this one
         try:
             spec = self._ask_the_others(name, path, target)
         finally:
@@ -41,13 +41,13 @@ class _ZooFinder:
 
 
 def start() -> None:
-    """What an interpreter runs at its start. ``SB3_HDS_NO_ZOO=1`` switches it off."""
+    """Run at the start of an interpreter. ``SB3_HDS_NO_ZOO=1`` switches it off."""
     if os.environ.get("SB3_HDS_NO_ZOO", "0") in ("", "0"):
         install()
 
 
 def install() -> None:
-    """Extend ``rl_zoo3`` now, where it is imported already, and when it is imported, elsewhere."""
+    """Extend the modules of ``rl_zoo3`` that are imported already, and the others on import."""
     if any(isinstance(finder, _ZooFinder) for finder in sys.meta_path):
         return
     sys.meta_path.insert(0, _ZooFinder())
@@ -71,7 +71,7 @@ def _extend_after_execution(spec) -> None:
 
 
 def _extend(module) -> None:
-    """A zoo that cannot be extended is still a zoo: whatever goes wrong is only a warning."""
+    """Extend a module; a failure is only a warning, since the zoo works without us."""
     try:
         from rl_zoo_plugin import tables
 

@@ -1,13 +1,13 @@
 """Stand-ins for algorithms, so that registering them does not import JAX."""
 
-import difflib
 import inspect
 from collections.abc import Iterable
 from typing import Any
 
 from rl_zoo_plugin import trials
+from sb3_hds.errors import did_you_mean
 
-#: a key that begins with it sets one of ``policy_kwargs``, and leaves the others as they are
+#: prefix of keys that set a single entry of ``policy_kwargs``
 OF_POLICY = "policy_kwargs."
 
 
@@ -15,7 +15,7 @@ class LazyAlgorithm:
     """
     Stands in ``rl_zoo3.ALGOS`` for a class of ``sb3_hds`` that is imported on first use.
 
-    It is called, loaded from and read like the class. It is not a class: ``issubclass`` and
+    It can be called, loaded from and read like the class. It is not a class: ``issubclass`` and
     ``isinstance`` need :meth:`resolve`.
 
     :param class_name: the public name in ``sb3_hds``
@@ -36,7 +36,7 @@ class LazyAlgorithm:
         :raises TypeError: for a hyperparameter that the algorithm does not have
         """
         algorithm = self.resolve()
-        hyperparams, of_policy = _apart(hyperparams)
+        hyperparams, of_policy = _split(hyperparams)
         if of_policy:
             hyperparams["policy_kwargs"] = {**(hyperparams.get("policy_kwargs") or {}), **of_policy}
         _refuse_unknown(algorithm, hyperparams)
@@ -45,8 +45,8 @@ class LazyAlgorithm:
 
     def load(self, path: Any, *args: Any, **hyperparams: Any) -> Any:
         """
-        SB3's ``load``, which would write any keyword into the model unseen. A policy is loaded as
-        it is: the zoo does not hand ``policy_kwargs`` on, nor does this a single one of them.
+        SB3's ``load``, which would write any keyword into the model unchecked. The policy is loaded
+        as saved: like the zoo, this drops ``policy_kwargs`` and its single entries.
 
         :raises TypeError: for a hyperparameter that the algorithm does not have
         """
@@ -54,8 +54,8 @@ class LazyAlgorithm:
         loaders = (
             vars(base)["load"].__func__ for base in algorithm.__mro__ if "load" in vars(base)
         )
-        known = {name for loader in loaders for name in _parameters(loader)}
-        hyperparams, _ = _apart(hyperparams)
+        known = {name for loader in loaders for name in parameters_of(loader)}
+        hyperparams, _ = _split(hyperparams)
         _refuse_unknown(algorithm, hyperparams, also=known)
         return algorithm.load(path, *args, **hyperparams)
 
@@ -68,24 +68,20 @@ class LazyAlgorithm:
         return f"<sb3_hds.{self.__name__}, imported on first use>"
 
 
-def _apart(hyperparams: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """:return: those of the algorithm, and single ones of its policy by their own names"""
-    own = {name: value for name, value in hyperparams.items() if not name.startswith(OF_POLICY)}
-    of_policy = {
-        name.removeprefix(OF_POLICY): value
-        for name, value in hyperparams.items()
-        if name not in own
-    }
+def _split(hyperparams: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """:return: those of the algorithm, and those of its policy without their prefix"""
+    own, of_policy = {}, {}
+    for name, value in hyperparams.items():
+        if name.startswith(OF_POLICY):
+            of_policy[name.removeprefix(OF_POLICY)] = value
+        else:
+            own[name] = value
     return own, of_policy
 
 
-def _parameters(function: Any) -> dict[str, inspect.Parameter]:
+def parameters_of(function: Any) -> dict[str, inspect.Parameter]:
+    """:return: the parameters of a function, or of the constructor of a class"""
     return dict(inspect.signature(function).parameters)
-
-
-def parameters_of(algorithm: Any) -> dict[str, inspect.Parameter]:
-    """:return: of its constructor"""
-    return _parameters(algorithm)
 
 
 def _refuse_unknown(algorithm: Any, hyperparams: dict[str, Any], also: Iterable[str] = ()) -> None:
@@ -93,9 +89,8 @@ def _refuse_unknown(algorithm: Any, hyperparams: dict[str, Any], also: Iterable[
     unknown = sorted(set(hyperparams) - set(known) - set(also))
     if not unknown:
         return
-    close = difflib.get_close_matches(unknown[0], known, n=1)
-    hint = f" Did you mean '{close[0]}'?" if close else ""
     raise TypeError(
-        f"{algorithm.__name__} has no hyperparameter '{unknown[0]}'.{hint} "
+        f"{algorithm.__name__} has no hyperparameter '{unknown[0]}'."
+        f"{did_you_mean(unknown[0], known)} "
         f"Look at the yml file, -params and --conf-file. It has: {', '.join(known)}."
     )

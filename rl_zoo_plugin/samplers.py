@@ -1,10 +1,10 @@
 """
-What ``rl_zoo3 train -optimize`` varies.
+Search spaces of ``rl_zoo3 train -optimize``.
 
 A sampler suggests plain numbers and names; its converter turns them into hyperparameters. The
-sampler returns what the converter makes of ``trial.params``, so that ``--trial-id`` gives a trial
-back exactly. What a file says of ``policy_kwargs`` stays, except for what is varied: the zoo would
-replace all of them.
+sampler returns the converted ``trial.params``, so that ``--trial-id`` reproduces a trial exactly.
+Entries of ``policy_kwargs`` in a file that are not searched stay; the zoo would replace all of
+them.
 """
 
 from collections.abc import Callable
@@ -23,16 +23,16 @@ _BLOCKS = {
     "big": {"pi": [256], "qf": [512, 512]},
 }
 
-# Of OpenLoop: the smallest population that is tried, how many generations a trial should have, and
-# how many steps a whole episode is taken to have.
-_SMALLEST, _FEWEST_GENERATIONS, _WHOLE_EPISODE = 8, 5, 1_000
+# Of OpenLoop: smallest population, minimum number of generations in a trial, and assumed steps of
+# an episode without a horizon.
+_SMALLEST, _FEWEST_GENERATIONS, _EPISODE = 8, 5, 1_000
 
 
 class Sampler(NamedTuple):
     """
-    What the zoo calls for a new trial.
+    Called by the zoo for a new trial.
 
-    :param suggest: draws plain values for an Optuna trial with so many copies of the environment
+    :param suggest: draws plain values, given an Optuna trial and the number of environments
     :param convert: turns ``trial.params`` into hyperparameters
     """
 
@@ -42,7 +42,7 @@ class Sampler(NamedTuple):
     def __call__(self, trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
         """
         :param trial: an Optuna trial
-        :param n_actions: unused, as is the last: the zoo calls every sampler with them
+        :param n_actions: unused, as ``additional_args``: the zoo passes both to every sampler
         :param n_envs: copies of the environment
         :return: hyperparameters
         """
@@ -72,7 +72,7 @@ def _convert_planner(sampled: Params) -> Params:
     }
 
 
-def _suggest_usual(trial: Any) -> None:
+def _suggest_common(trial: Any) -> None:
     trial.suggest_float("one_minus_gamma", 1e-3, 0.1, log=True)
     trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True)
     trial.suggest_int("batch_size_pow", 5, 9)
@@ -81,7 +81,7 @@ def _suggest_usual(trial: Any) -> None:
 
 
 def _suggest_model_free(trial: Any, _: int) -> None:
-    _suggest_usual(trial)
+    _suggest_common(trial)
     trial.suggest_int("gradient_steps_pow", 0, 4)
     trial.suggest_categorical("policy_delay", [1, 2, 3, 10, 20])
 
@@ -101,7 +101,7 @@ def _convert_model_free(sampled: Params) -> Params:
 
 
 def _with_policy_argument(name: str) -> Callable[[Params], Params]:
-    """:return: a converter for model-free algorithms, where this is an argument of the policy"""
+    """:return: a converter for model-free algorithms that have this argument in the policy"""
 
     def convert(sampled: Params) -> Params:
         params = _convert_model_free(sampled)
@@ -130,10 +130,10 @@ def _suggest_tqc(trial: Any, n_envs: int) -> None:
 
 
 def _suggest_td7(trial: Any, n_envs: int) -> None:
-    """In one environment, TD7 updates once for each step: there is no number to suggest."""
+    """With one environment, TD7 makes one update per step, so there is no number to suggest."""
     trial.suggest_categorical("target_update_interval", [100, 250, 500])
     trial.suggest_float("exploration_noise", 0.05, 0.4, log=True)
-    _suggest_usual(trial)
+    _suggest_common(trial)
     if n_envs > 1:
         trial.suggest_int("gradient_steps_pow", 0, 4)
     trial.suggest_categorical("policy_delay", [1, 2, 3])
@@ -143,15 +143,15 @@ def _suggest_gsde(trial: Any, _: int) -> None:
     trial.suggest_categorical("train_freq", [4, 8, 16, 64])
     trial.suggest_float("log_std_init", -4.0, 0.0)
     trial.suggest_float("tau", 1e-3, 0.08, log=True)
-    _suggest_usual(trial)
+    _suggest_common(trial)
     trial.suggest_int("gradient_steps_pow", 0, 6)
 
 
 def _suggest_open_loop(trial: Any, _: int) -> None:
-    horizon = trial.suggest_categorical("horizon", [100, 200, 400, 0]) or _WHOLE_EPISODE
-    most = _candidates(horizon)
-    n_resets = trial.suggest_int("n_resets", 1, min(4, max(1, most // _SMALLEST)))
-    largest = max(_SMALLEST, min(32, most // n_resets)).bit_length() - 1
+    horizon = trial.suggest_categorical("horizon", [100, 200, 400, 0]) or _EPISODE
+    episodes = _episodes_per_generation(horizon)
+    n_resets = trial.suggest_int("n_resets", 1, min(4, max(1, episodes // _SMALLEST)))
+    largest = max(_SMALLEST, min(32, episodes // n_resets)).bit_length() - 1
     trial.suggest_int("population_pow", 3, largest)
     trial.suggest_float("initial_sigma", 0.3, 2.0, log=True)
     trial.suggest_float("kp", 0.5, 20.0, log=True)
@@ -163,8 +163,8 @@ def _suggest_open_loop(trial: Any, _: int) -> None:
     trial.suggest_float("frequency_ratio", 3.0, 20.0, log=True)
 
 
-def _candidates(horizon: int) -> int:
-    """:return: episodes of this length in each of a few generations"""
+def _episodes_per_generation(horizon: int) -> int:
+    """:return: episodes of this length that the budget has for each generation"""
     now = trials.budget()
     return 32 * 4 if now is None else now.n_timesteps // (_FEWEST_GENERATIONS * horizon)
 
@@ -181,7 +181,7 @@ def _convert_open_loop(sampled: Params) -> Params:
     }
 
 
-#: what an algorithm's entry in ``sb3_hds.algos.registry`` may name
+#: samplers that an entry of ``sb3_hds.algos.registry`` may name
 SAMPLERS = {
     "planner": Sampler(_suggest_planner, _convert_planner),
     "model_free": Sampler(_suggest_model_free, _convert_model_free),

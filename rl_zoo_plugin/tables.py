@@ -1,4 +1,4 @@
-"""What ``rl_zoo3`` gets from ``sb3_hds``, and into which of its tables it goes."""
+"""Entries of ``sb3_hds`` in the tables of ``rl_zoo3``."""
 
 import functools
 import inspect
@@ -11,7 +11,7 @@ from rl_zoo_plugin import trials
 from rl_zoo_plugin.lazy import LazyAlgorithm
 from sb3_hds.algos.registry import ALGORITHMS  # registers our environments with Gymnasium, too
 
-_PROGRESS = "rl_zoo_plugin.trial_progress.TrialProgress"
+_PROGRESS = "rl_zoo_plugin.callbacks.TrialProgress"
 _PROGRESS_BAR = "stable_baselines3.common.callbacks.ProgressBarCallback"
 
 
@@ -20,11 +20,8 @@ def hyperparams_file(algo: str) -> Path:
     :param algo: an id of ``sb3_hds.algos.registry.ALGORITHMS``
     :return: its zoo-format yml file: next to this module in a wheel, in the root of a checkout
     """
-    here = Path(__file__).parent
-    folder = (
-        here / "hyperparams" if (here / "hyperparams").is_dir() else here.parent / "hyperparams"
-    )
-    return folder / f"{algo}.yml"
+    installed, checkout = (folder / "hyperparams" for folder in Path(__file__).parents[:2])
+    return (installed if installed.is_dir() else checkout) / f"{algo}.yml"
 
 
 def _extend_algorithms(utils: ModuleType) -> None:
@@ -42,7 +39,7 @@ def _extend_samplers(hyperparams_opt: ModuleType) -> None:
 
 
 def _extend_manager(exp_manager: ModuleType) -> None:
-    """Our algorithms read our yml files unless the user names another one."""
+    """Our algorithms read our yml files, unless the user names another file."""
     manager = exp_manager.ExperimentManager
     original = manager.__init__
     signature = inspect.signature(original)
@@ -61,14 +58,14 @@ def _extend_manager(exp_manager: ModuleType) -> None:
 
 
 def _extend_trials(exp_manager: ModuleType, manager: Any) -> None:
-    """Trials of our algorithms know how many steps they have, and show how far they are."""
+    """Trials of our algorithms know their budget of steps, and print their progress."""
     optimize, objective = manager.hyperparameters_optimization, manager.objective
 
     def is_ours(self: Any) -> bool:
         return isinstance(exp_manager.ALGOS.get(self.algo), LazyAlgorithm)
 
     @functools.wraps(optimize)
-    def optimize_visibly(self: Any) -> None:
+    def optimize_with_progress(self: Any) -> None:
         if is_ours(self):
             given = self.specified_callbacks or []
             given = given if isinstance(given, list) else [given]
@@ -77,13 +74,16 @@ def _extend_trials(exp_manager: ModuleType, manager: Any) -> None:
         optimize(self)
 
     @functools.wraps(objective)
-    def objective_within(self: Any, trial: Any) -> float:
+    def objective_with_budget(self: Any, trial: Any) -> float:
         if not is_ours(self):
             return objective(self, trial)
         with trials.running(trial.number, self.n_timesteps):
             return objective(self, trial)
 
-    manager.hyperparameters_optimization, manager.objective = optimize_visibly, objective_within
+    manager.hyperparameters_optimization, manager.objective = (
+        optimize_with_progress,
+        objective_with_budget,
+    )
 
 
 EXTENSIONS: dict[str, Callable[[ModuleType], None]] = {

@@ -1,7 +1,7 @@
 """
-What a trial of ``rl_zoo3 train -optimize`` has to get by with.
+The budget of a trial of ``rl_zoo3 train -optimize``.
 
-The zoo tells samplers and algorithms nothing of ``-n``: without it, a trial may spend all of its
+The zoo does not pass ``-n`` on to samplers and algorithms. Without it, a trial may spend all of its
 steps on random actions, and reserve memory for a million transitions.
 """
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, NamedTuple
 
-# A quarter of the steps may pass before learning starts.
+# At most a quarter of the steps may pass before learning starts.
 _STARTS = 4
 
 
@@ -28,7 +28,7 @@ _NOW: ContextVar[Budget | None] = ContextVar("budget", default=None)
 
 
 def budget() -> Budget | None:
-    """:return: of the trial that runs in this thread; None: none does"""
+    """:return: of the trial that runs in this thread; None: there is none"""
     return _NOW.get()
 
 
@@ -36,7 +36,7 @@ def budget() -> Budget | None:
 def running(trial: int, n_timesteps: int) -> Iterator[None]:
     """
     :param trial: its number
-    :param n_timesteps: that it has
+    :param n_timesteps: of the trial
     """
     token = _NOW.set(Budget(trial, n_timesteps))
     try:
@@ -46,27 +46,27 @@ def running(trial: int, n_timesteps: int) -> Iterator[None]:
 
 
 def learning_starts_range() -> tuple[int, int]:
-    """:return: the least and the most that a trial is worth trying with"""
+    """:return: the smallest and the largest value to sample"""
     now = budget()
     if now is None:
         return 100, 10_000
-    most = max(1, min(10_000, now.n_timesteps // _STARTS))
-    return min(100, max(1, most // 2)), most
+    largest = max(1, min(10_000, now.n_timesteps // _STARTS))
+    return min(100, max(1, largest // 2)), largest
 
 
 def capped(hyperparams: dict[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
     """
     :param hyperparams: from a file, from ``-params``, and sampled
     :param defaults: of the algorithm
-    :return: with no more than the trial has steps for; without a trial, as they were
+    :return: limited to the steps of the trial; unchanged outside a trial
     """
     now = budget()
     if now is None:
         return hyperparams
-    most = {"buffer_size": now.n_timesteps, "learning_starts": now.n_timesteps // _STARTS}
-    too_many = {
+    limits = {"buffer_size": now.n_timesteps, "learning_starts": now.n_timesteps // _STARTS}
+    reduced = {
         name: limit
-        for name, limit in most.items()
+        for name, limit in limits.items()
         if name in defaults and hyperparams.get(name, defaults[name]) > limit
     }
-    return hyperparams | too_many
+    return hyperparams | reduced

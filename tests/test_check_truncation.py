@@ -137,9 +137,11 @@ def test_time_outs_arrive_in_every_autoreset_mode_and_limits_that_terminate_are_
     assert "ended as terminations after exactly 20 steps" in text
 
 
-NEVER_ACTS = "limit of 1000 steps of .* never acts.* that of 20 steps of TimeLimit .*_steps=1000"
-SELDOM = "(1[2-9]|20) of 20 .* cut after exactly 20 .* limit of 500 steps of TimeLimit never"
-REMOTE = "20 of 20 .* cut after exactly 20 .* 1000 steps of the outermost wrapper never acts"
+NEVER_ACTS = (
+    "limit of 1000 steps of .* never takes effect.* that of 20 steps of TimeLimit .*_steps=1000"
+)
+SELDOM = "(1[2-9]|20) of 20 .* truncated after exactly 20 .* limit of 500 steps of TimeLimit never"
+REMOTE = "20 of 20 .* truncated after exactly 20 .* 1000 steps of the outermost wrapper never"
 
 
 @each(
@@ -147,7 +149,7 @@ REMOTE = "20 of 20 .* cut after exactly 20 .* 1000 steps of the outermost wrappe
     # Of 20 episodes, 0.98^49 = 37 % reach the limit, all others end at times of their own.
     (lambda: Drawn(0.02, limit=50), "[3-9] of 2. .* terminations after exactly 50 steps"),
     # The number of steps gives it away as well: two paragraphs.
-    (lambda: Drawn(limit=LIMIT, how="info"), "20 time-outs of 20 ends stood only in info.*"),
+    (lambda: Drawn(limit=LIMIT, how="info"), "20 time-outs of 20 ends came only as info.*"),
     (lambda: OldStyle(limit=LIMIT), "With a single 'done', a time-out cannot"),
     (lambda: OldReset(limit=LIMIT), "from reset.seed=..., options=...."),
     (Drawn, "No episode ended in 2000 steps"),

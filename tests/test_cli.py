@@ -14,7 +14,7 @@ from cases import each
 from measuring import measured
 
 from sb3_hds import Trajectories, cli, effects, twins
-from sb3_hds.cli import listing
+from sb3_hds.cli import catalogue
 from sb3_hds.cli import measured as measured_room
 from sb3_hds.experiments import PolicyGain
 from sb3_hds.experiments.policy_gain import _summarised
@@ -163,8 +163,8 @@ def test_what_exists_is_listed_with_units_and_filtered_by_words(capsys):
 
 
 def test_the_stored_list_of_effects_is_what_their_classes_say():
-    assert listing.stored_rows() == listing.rows_of_effects(), (
-        "write it anew: python -m sb3_hds.cli.listing"
+    assert catalogue.stored_rows() == catalogue.rows_of_effects(), (
+        "write it anew: python -m sb3_hds.cli.catalogue"
     )
 
 
@@ -346,12 +346,12 @@ def test_an_interrupt_ends_any_command_with_one_line():
     """Also one that is lost as an exception, as in a callback of the garbage collector."""
     code = (
         "import os, signal, sys, time; from sb3_hds import cli\n"
-        "from sb3_hds.cli import listing\n"
+        "from sb3_hds.cli import catalogue\n"
         "def slow(given):\n"
         "    try: os.kill(os.getpid(), signal.SIGINT)\n"
         "    except KeyboardInterrupt: pass\n"
         "    time.sleep(20)\n"
-        "listing.run_effects = slow\n"
+        "catalogue.run_effects = slow\n"
         "sys.argv = ['sb3-hds', 'effects']\n"
         "sys.exit(cli.main())\n"
     )

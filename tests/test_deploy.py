@@ -211,6 +211,10 @@ def gait(tmp_path_factory):
     return path
 
 
+def test_the_interval_of_oscillators_is_known_without_an_environment(gait):
+    assert OnnxPolicy(gait).dt == 0.03
+
+
 def test_phases_are_a_state_that_episodes_begin_anew(gait):
     policy, loaded = oscillators("track"), OnnxPolicy(gait)
     observations = drawn(VECTOR, 2 * 300, seed=0).reshape(300, 2, 3) / 3.0

@@ -102,7 +102,7 @@ def test_steps_that_are_no_transitions_are_refused_at_the_door():
     for env, says in (
         (CountingVector(N, AutoresetMode.NEXT_STEP), "That step is no transition"),
         (gymnasium.make_vec("CartPole-v1", 2, "vector_entry_point"), "That step is no transition"),
-        (silent, "does not say how it resets"),
+        (silent, "does not declare how it resets"),
         (Counting(), r"takes a gymnasium\.vector\.VectorEnv"),
     ):
         with pytest.raises(ParameterError, match=says):

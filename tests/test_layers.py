@@ -44,16 +44,17 @@ LIBRARIES = {
     "sysid/reporting/film.py": {"imageio_ffmpeg"},
     "envs": STEPPING | {"mujoco"},
     "wrappers": STEPPING,
-    "wrappers/actions/filters.py": {"scipy"},
-    "wrappers/safety/projection.py": {"daqp"},
-    "wrappers/vec_env.py": {"stable_baselines3.common.monitor"},
+    "wrappers/safety/shield.py": {"daqp"},
+    "wrappers/vec_env.py": {
+        "stable_baselines3.common.env_util",
+        "stable_baselines3.common.monitor",
+    },
     "algos": LEARNING,
     "deploy": LEARNING | {"jax2onnx", "onnx", "onnxruntime"},
     "experiments": LEARNING | TABLES | {"scipy", "jinja2", "rliable", "ray"},
     "cli": LEARNING | TABLES,
     "rl_zoo_plugin": {"rl_zoo3", "optuna"},
-    "rl_zoo_plugin/checkpoints.py": {"stable_baselines3", "numpy"},
-    "rl_zoo_plugin/trial_progress.py": {"stable_baselines3"},
+    "rl_zoo_plugin/callbacks.py": {"stable_baselines3", "numpy"},
 }
 """What a layer, or one file of it, imports from outside; the standard library is free."""
 

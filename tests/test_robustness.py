@@ -13,7 +13,7 @@ from small_models import small
 from test_open_loop import SWIMMER
 
 from sb3_hds import OpenLoop, algos, cli
-from sb3_hds.cli import classes
+from sb3_hds.cli import policies
 from sb3_hds.errors import EnvironmentMismatchError, TrajectoryError
 from sb3_hds.experiments import PERTURBATIONS, Robustness, measure_robustness, returns_of
 from sb3_hds.wrappers import CPGPrior, LowPassAction
@@ -119,13 +119,13 @@ def test_the_command_takes_what_the_environment_was_made_and_wrapped_with(tmp_pa
     kinds = [row["perturbation"] for row in rows]
     assert kinds == [kind for kind in PERTURBATIONS if kind != "push"]
     # Without the filter, whose state is observed.
-    assert without == 1 and "put the wrappers around it" in capsys.readouterr().err
+    assert without == 1 and "same arguments and wrappers" in capsys.readouterr().err
 
 
 @each(("sbx.SAC", "MlpPolicy"), pytest.param("ppo_lstm", "MlpLstmPolicy", marks=EXPENSIVE))
 def test_the_command_runs_models_of_the_packages_around(name, policy, tmp_path, capsys):
     pytest.importorskip("sb3_contrib")
-    classes.algorithm(name)(policy, "Pendulum-v1", seed=0).save(tmp_path / "model")
+    policies.algorithm(name)(policy, "Pendulum-v1", seed=0).save(tmp_path / "model")
     words = ["--algo", name, "--model", str(tmp_path / "model.zip"), "--env", "Pendulum-v1"]
 
     assert cli.main(["robustness", *words, "--episodes", "1"]) == 0

@@ -23,7 +23,7 @@ from sb3_hds.wrappers import (
     Phase,
     SharedControlTemplate,
 )
-from sb3_hds.wrappers.safety.projection import nearest
+from sb3_hds.wrappers.safety.shield import nearest
 
 PHASES = [
     {
@@ -258,7 +258,7 @@ def test_a_joint_that_is_not_commanded_by_its_speed_is_found_out():
     for env in (lagging, exact):
         env.reset(seed=0, options={"q": [0.0]})
     assert exact.step(np.array([0.5], np.float32))[-1]["tracking_error"] < 1e-6
-    with pytest.raises(SafetyError, match="missed what its speed command asks for"):
+    with pytest.raises(SafetyError, match="missed its commanded position"):
         lagging.step(np.array([0.5], np.float32))
 
 
@@ -310,7 +310,7 @@ FORWARD = {"action_space": spaces.Box(1.0, 5.0, (2,))}
     (ActionShield, {"constraints": ([[1.0, 0.0, 0.0]], [1.0])}, "of shape"),
     (ActionShield, {"constraints": ([[1.0, 0.0], [-1.0, 0.0]], [-1.0] * 2)}, "no command"),
     (ActionShield, {"constraints": "nowhere.at_all"}, "no function"),
-    (SharedControlTemplate, {"phases": [Phase("a", TURN)] * 2}, "names of their own"),
+    (SharedControlTemplate, {"phases": [Phase("a", TURN)] * 2}, "unique names"),
     (SharedControlTemplate, {"phases": [Phase("a", [[1.0]])]}, r"shape \(2, n_inputs\)"),
     (one_phase, {"transitions": [{"to": "b", "when": distances}]}, "leads to"),
     (one_phase, {"transitions": [{"to": "a", "when": {"channel": 9}}]}, "condition"),

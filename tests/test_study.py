@@ -92,7 +92,7 @@ def test_a_study_is_the_product_of_its_lists(tmp_path):
         ({"evaluation": {"often": 3}}, "takes every, episodes"),
         ({"algorithms": [{"label": "x"}]}, "lacks 'algo'"),
         ({"algorithms": [{"label": "Wide", "algo": "droq"}]}, "lower case"),
-        ({"algorithms": ["droq", {"algo": "droq", "hyperparams": {"tau": 0.1}}]}, "a label"),
+        ({"algorithms": ["droq", {"algo": "droq", "hyperparams": {"tau": 0.1}}]}, "its own label"),
     ],
 )
 def test_what_a_study_cannot_be_is_refused(changes, why, tmp_path):
@@ -184,10 +184,10 @@ def test_folders_that_are_taken_are_refused(tmp_path):
     study, folder = study_of(tmp_path, envs=["Pendulum-v1"]), tmp_path / "logs"
     run_study(study, folder, command=writer(tmp_path / "ledger"), tell=lambda _: None)
 
-    with pytest.raises(StudyError, match="with another steps"):
+    with pytest.raises(StudyError, match="with different steps"):
         run_study(study_of(tmp_path, envs=["Pendulum-v1"], budget={"steps": 500}), folder)
     (tmp_path / "other" / "hds" / "Pendulum-v1_1").mkdir(parents=True)
-    with pytest.raises(StudyError, match="not of a study"):
+    with pytest.raises(StudyError, match="does not belong to a study"):
         run_study(study, tmp_path / "other")
 
 

@@ -11,8 +11,7 @@ from cases import each
 from small_models import small
 
 import sb3_hds
-from rl_zoo_plugin import __main__, hook, lazy, samplers, tables, trials
-from rl_zoo_plugin import trial_progress as progress_of_trials
+from rl_zoo_plugin import __main__, callbacks, hook, lazy, samplers, tables, trials
 from rl_zoo_plugin.lazy import LazyAlgorithm
 from rl_zoo_plugin.samplers import SAMPLERS
 from sb3_hds.algos.registry import ALGORITHMS
@@ -114,7 +113,7 @@ def test_a_trial_is_recreated_exactly_has_arguments_and_steps_left_to_learn_from
         assert sampler.convert(study.trials[-1].params) == sampled
         # The zoo writes them to config.yml, which has to be readable without this package.
         assert yaml.safe_load(yaml.safe_dump(sampled)) == sampled
-        arguments, of_policy = lazy._apart(sampled)
+        arguments, of_policy = lazy._split(sampled)
         assert set(arguments) <= known and set(of_policy) <= of_policies
         n_dropped = sampled.get("top_quantiles_to_drop_per_net", 0)
         assert 0 <= n_dropped < sampled.get("policy_kwargs.n_quantiles", 1 + n_dropped)
@@ -159,9 +158,9 @@ def test_a_trial_has_memory_for_its_own_steps_alone():
 
 
 def test_a_trial_says_now_and_then_how_far_it_is(capsys, monkeypatch):
-    monkeypatch.setattr(progress_of_trials, "_EVERY", 0.0)
+    monkeypatch.setattr(callbacks, "_PROGRESS_INTERVAL", 0.0)
     with trials.running(3, 20):
-        progress = progress_of_trials.TrialProgress()
+        progress = callbacks.TrialProgress()
     small("droq", learning_starts=100).learn(25, callback=progress)
     progress.locals["pretraining"] = True
     progress.on_step()
@@ -188,7 +187,7 @@ class Manager:
 
 @each(
     ({"show_progress": True}, "stable_baselines3.common.callbacks.ProgressBarCallback"),
-    ({"show_progress": True, "n_jobs": 2}, "rl_zoo_plugin.trial_progress.TrialProgress"),
+    ({"show_progress": True, "n_jobs": 2}, "rl_zoo_plugin.callbacks.TrialProgress"),
 )
 def test_trials_of_ours_know_their_steps_and_show_where_they_are(given, shown, monkeypatch):
     manager = type("Manager", (Manager,), dict(vars(Manager)))

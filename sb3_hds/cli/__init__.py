@@ -30,9 +30,9 @@ _INTERRUPTED = "sb3-hds: interrupted"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
-    :param arguments: as on the command line; default: those of this process
-    :return: 0 on any verdict; 1 for invalid input, with one line on why, or where a twin fails its
-        check; 130 when interrupted
+    :param arguments: of the command line; default: ``sys.argv[1:]``
+    :return: 0 on any verdict; 1 for invalid input, with a message of one line, or if a twin
+        fails its check; 130 when interrupted
     :raises SystemExit: with 2, for an unknown command or option
     """
     if arguments is None:
@@ -45,47 +45,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _stop(*_: Any) -> None:
-    """End at once: an exception gets lost in a callback of JAX, and breaks the import of one."""
+    """Exit at once: JAX callbacks swallow exceptions, and one raised during an import breaks it."""
     for stream in (sys.stdout, sys.stderr):
-        # A progress bar has hidden the cursor.
+        # A progress bar may have hidden the cursor.
         print("\x1b[?25h" if stream.isatty() else "", end="", file=stream, flush=True)
     print(_INTERRUPTED, file=sys.stderr, flush=True)
     os._exit(130)
 
 
 def _run(given: argparse.Namespace) -> int:
-    from sb3_hds.cli import (
-        audit,
-        calibrate,
-        columns,
-        diagnose,
-        export,
-        listing,
-        robustness,
-        study,
-        twins,
-    )
-    from sb3_hds.cli import run as run_file
     from sb3_hds.errors import SB3HDSError
 
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
-            # Meant for programmers.
+            # They address programmers, not users.
             warnings.simplefilter("ignore", DeprecationWarning)
-            code = {
-                "columns": columns.run,
-                "audit": audit.run,
-                "calibrate": calibrate.run,
-                "diagnose": diagnose.run,
-                "export": export.run,
-                "robustness": robustness.run,
-                "run": run_file.run,
-                "study": study.run,
-                "effects": listing.run_effects,
-                "twins": twins.run,
-            }[given.command](given)
-            return code or 0
+            return given.run(given) or 0
     except BrokenPipeError:
         return 0
     except (SB3HDSError, OSError, ImportError) as error:
@@ -101,98 +77,32 @@ def _warn(
     file: Any = None,
     line: str | None = None,
 ) -> None:
-    """One line, without the code that warns."""
+    """Print a warning as one line, without the source line that raised it."""
     print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def parser() -> argparse.ArgumentParser:
-    """:return: what the command understands"""
-    from sb3_hds.cli import audit, calibrate, columns, export, measured, study, twins
-    from sb3_hds.cli import run as run_file
-    from sb3_hds.cli.parsing import Parser, Version
+    """:return: the parser of ``sb3-hds`` and its commands"""
+    from sb3_hds.cli import calibrate, catalogue, deployment, diagnose, logs, robustness, study
+    from sb3_hds.cli.arguments import Parser, Version
 
-    every = Parser(
+    top = Parser(
         prog="sb3-hds",
         description="Diagnose a simulation with measured data; test how robust a policy is.",
     )
-    every.add_argument("--version", action=Version)
-    commands = every.add_subparsers(dest="command", required=True, metavar="command")
-    ask = commands.add_parser("diagnose", help="name the cause, from measured data")
-    measured.add_arguments(ask)
-    ask.add_argument(
-        "--calibrate",
-        nargs="*",
-        default=[],
-        help="parameters of which the nominal value is not trusted",
-    )
-    ask.add_argument("--effects", nargs="*", help="candidates; default: all, see 'sb3-hds effects'")
-    ask.add_argument("--budget", choices=("full", "quick"), default="full")
-    ask.add_argument("--seed", type=int, default=0)
-    ask.add_argument("--report", help="HTML page to write")
-    ask.add_argument("--animate", help="MP4 film to write: measured and predicted motion")
-    ask.add_argument("--json", help="JSON file to write")
-    measured.add_write(ask)
-    design = ask.add_argument_group("what to record next", "commands that decide what is open")
-    design.add_argument("--next", metavar="FILE", help="CSV or NPZ file of commands to write")
-    design.add_argument("--limits", metavar="FILE", help="yml file: what the machine may do")
-    design.add_argument("--recordings", type=int, default=1, help="to design; default: 1")
-    design.add_argument("--seconds", type=float, default=10.0, help="of each; default: 10")
-    gain = ask.add_argument_group("policy gain", "policies from both twins, on the real system")
-    gain.add_argument("--env", help="id of the real system")
-    gain.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE", help="of it")
-    gain.add_argument("--algo", default="hds", help="id in the zoo; default: hds")
-    gain.add_argument("--policies", type=int, default=5, help="trained in each twin; default: 5")
-    gain.add_argument("--policy-budget", type=int, default=0, help="steps of training in a twin")
-    gain.add_argument("--episodes", type=int, default=20, help="for each policy; default: 20")
-    gain.add_argument(
-        "--hyperparams", nargs="*", default=[], metavar="NAME:VALUE", help="of the algorithm"
-    )
-    audit.add_arguments(commands.add_parser("audit", help="find defects of measured data"))
-    calibrate.add_arguments(
-        commands.add_parser("calibrate", help="estimate parameters of a twin from measured data")
-    )
-    shake = commands.add_parser("robustness", help="return under noise, failed sensors, pushes")
-    shake.add_argument(
-        "--algo", required=True, help="id in the zoo, ours or rl_zoo3's, or a class: sbx.SAC"
-    )
-    shake.add_argument("--model", required=True, help="file that the algorithm saved")
-    shake.add_argument("--env", required=True, help="environment id")
-    shake.add_argument("--env-kwargs", nargs="*", default=[], metavar="NAME:VALUE")
-    shake.add_argument(
-        "--env-wrapper",
-        nargs="*",
-        default=[],
-        metavar="CLASS",
-        help="as trained, the one next to the environment first: package.Wrapper, or with "
-        "arguments as in yml, 'package.Wrapper: {cutoff: 4.0}'",
-    )
-    shake.add_argument("--episodes", type=int, default=20, help="for each perturbation")
-    shake.add_argument("--encoders", choices=("own", "observation"), default="own")
-    shake.add_argument("--vecnormalize", help="vecnormalize.pkl of the training")
-    shake.add_argument("--push", type=float, default=5.0, help="force on the torso [N]")
-    shake.add_argument("--csv", help="table to write")
-    columns.add_arguments(
-        commands.add_parser("columns", help="list what is in a log, with a map to start from")
-    )
-    export.add_arguments(
-        commands.add_parser("export", help="write a policy as ONNX, or as a header of C")
-    )
-    run_file.add_arguments(
-        commands.add_parser("run", help="act by an exported policy, in real time, and record it")
-    )
-    study.add_arguments(
-        commands.add_parser("study", help="run algorithms on environments, with seeds, and report")
-    )
-    known = commands.add_parser("effects", help="list the candidates, with units and explanations")
-    known.add_argument(
-        "words",
-        nargs="*",
-        metavar="WORD",
-        help="list only those that mention all of these",
-    )
-    twins.add_arguments(
-        commands.add_parser(
-            "twins", help="list the simulations, with their parameters, or check one"
-        )
-    )
-    return every
+    top.add_argument("--version", action=Version)
+    commands = top.add_subparsers(dest="command", required=True, metavar="command")
+    for name, add, explained in (
+        ("diagnose", diagnose.add_arguments, "name the cause, from measured data"),
+        ("audit", logs.add_audit, "find defects in measured data"),
+        ("calibrate", calibrate.add_arguments, "estimate parameters of a twin from measured data"),
+        ("robustness", robustness.add_arguments, "return under noise, failed sensors and pushes"),
+        ("columns", logs.add_columns, "list the signals of a log, with a map to start from"),
+        ("export", deployment.add_export, "export a policy as an ONNX file or a C header"),
+        ("run", deployment.add_run, "run an exported policy in real time and record it"),
+        ("study", study.add_arguments, "run algorithms on environments over seeds, and report"),
+        ("effects", catalogue.add_effects, "list the candidate effects, with units"),
+        ("twins", catalogue.add_twins, "list the twins with their parameters, or check one"),
+    ):
+        add(commands.add_parser(name, help=explained))
+    return top

@@ -7,27 +7,27 @@ from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
 from sb3_hds.cli import measured
-from sb3_hds.cli.settings import names
+from sb3_hds.cli.arguments import names
 
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """:param command: that is to understand them"""
+    """:param command: ``sb3-hds calibrate``"""
     measured.add_arguments(command)
     command.add_argument(
         "--free",
         nargs="*",
         default=[],
-        help="parameters to estimate, or patterns in quotes, '*_damping'; default: all of the twin",
+        help="parameters to estimate, or quoted patterns: '*_damping'; default: all parameters",
     )
     command.add_argument(
         "--effects",
         nargs="*",
         default=[],
-        metavar="NAME[.PLACE]",
-        help="of 'sb3-hds effects' that the twin is extended by first, at every place or at one: "
+        metavar="NAME[.LOCATION]",
+        help="effects ('sb3-hds effects') to extend the twin by first, at all locations or at one: "
         "action_delay, coulomb_friction.hinge",
     )
     command.add_argument(
@@ -35,20 +35,20 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         nargs="*",
         default=[],
         metavar="PATTERN",
-        help="parameters that take one value, as of joints of a kind: '*_hip_joint_damping' "
+        help="parameters that share one value, such as those of like joints: '*_hip_joint_damping' "
         "'action_delay.*.delay'",
     )
     command.add_argument(
         "--errors",
         choices=("simulation", "force"),
         default="simulation",
-        help="that are made small: of simulated windows (the default), or of the equation of "
-        "motion, for logs of torques that the twin explains worse than its sensors measure",
+        help="errors to minimise: those of simulated windows (default), or of the equation of "
+        "motion, for torque logs whose model error exceeds the sensor noise",
     )
     command.add_argument(
-        "--windows", type=int, help="how many windows to use, drawn at random; default: all"
+        "--windows", type=int, help="number of windows, drawn at random; default: all"
     )
-    command.add_argument("--window", type=int, help="steps of a window; default: half a second")
+    command.add_argument("--window", type=int, help="steps per window; default: half a second")
     command.add_argument(
         "--prior",
         type=float,
@@ -57,28 +57,26 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "1 / PRIOR typical deviations; default: 0, no prior",
     )
     command.add_argument(
-        "--level", type=float, default=0.95, help="of the confidence intervals; default: 0.95"
+        "--level", type=float, default=0.95, help="confidence level of the intervals; default: 0.95"
     )
     command.add_argument("--json", help="JSON file to write")
     measured.add_write(command)
+    command.set_defaults(run=run)
 
 
 def run(given: argparse.Namespace) -> None:
-    """Audit, estimate, and report: on the screen, as JSON, as a twin."""
-    from sb3_hds.core.trajectories.storage import check_target
+    """Audit the data, estimate, and report on the screen, as JSON and as a twin."""
     from sb3_hds.data import audit
     from sb3_hds.errors import TrajectoryError
     from sb3_hds.sysid import calibrate
     from sb3_hds.sysid.estimation.calibrate import check_fits
     from sb3_hds.sysid.estimation.parameters import free_names
 
-    for target in filter(None, (given.json, given.write)):
-        check_target(target)
-    measured.check_write(given)
-    twin, data = measured.question(given)
+    measured.check_targets(given)
+    twin, data = measured.twin_and_data(given)
     twin = _extended(twin, names(given.effects))
-    tied = {pattern: _spelt_out([pattern], twin) for pattern in names(given.tied)}
-    free = free_names(twin, _spelt_out(names(given.free), twin) or None)
+    tied = {pattern: _expanded([pattern], twin) for pattern in names(given.tied)}
+    free = free_names(twin, _expanded(names(given.free), twin) or None)
     check_fits(twin, data)
     found, caveats = audit(data, twin=twin), []
     if given.correct and found.corrections:
@@ -109,21 +107,21 @@ def run(given: argparse.Namespace) -> None:
 
 
 def _extended(twin: "Twin", wanted: Sequence[str]) -> "Twin":
-    """The twin with the named effects, at the named places or at all."""
+    """The twin with the named effects, at the named location or at all."""
     from sb3_hds.effects import ALL, effect_named
 
-    places = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
+    locations = {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
     found = []
     for word in wanted:
-        name, _, place = word.partition(".")
+        name, _, location = word.partition(".")
         kind = effect_named(name, ALL)
-        at = [place] if place else [each.name for each in places[kind.slot]]
-        found += [kind(where) for where in at]
+        at = [location] if location else [each.name for each in locations[kind.slot]]
+        found += [kind(each) for each in at]
     return twin.extend(*found) if found else twin
 
 
-def _spelt_out(patterns: Sequence[str], twin: "Twin") -> list[str]:
-    """Expand patterns into names; a pattern without a match is kept, and refused later."""
+def _expanded(patterns: Sequence[str], twin: "Twin") -> list[str]:
+    """Expand patterns into names; one without a match stays, and is refused later."""
     found: dict[str, None] = {}
     for pattern in patterns:
         hits = [name for name in twin.parameters if fnmatchcase(name, pattern)]

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from sb3_hds.cli import measured
-from sb3_hds.cli.classes import algorithm
-from sb3_hds.cli.settings import names, settings
+from sb3_hds.cli.arguments import names, settings
+from sb3_hds.cli.policies import algorithm
+from sb3_hds.errors import ParameterError
 
 if TYPE_CHECKING:
     from sb3_hds.core import Twin
@@ -17,15 +18,65 @@ if TYPE_CHECKING:
     from sb3_hds.sysid.design import NextExperiment
 
 
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """:param command: ``sb3-hds diagnose``"""
+    measured.add_arguments(command)
+    command.add_argument(
+        "--calibrate",
+        nargs="*",
+        default=[],
+        help="parameters to estimate as well, since their nominal values are uncertain",
+    )
+    command.add_argument(
+        "--effects", nargs="*", help="candidate effects; default: all, see 'sb3-hds effects'"
+    )
+    command.add_argument("--budget", choices=("full", "quick"), default="full")
+    command.add_argument("--seed", type=int, default=0)
+    command.add_argument("--report", help="HTML page to write")
+    command.add_argument("--animate", help="MP4 film to write: measured and predicted motion")
+    command.add_argument("--json", help="JSON file to write")
+    measured.add_write(command)
+    design = command.add_argument_group(
+        "next experiment", "commands that distinguish the remaining hypotheses"
+    )
+    design.add_argument("--next", metavar="FILE", help="CSV or NPZ file to write the commands to")
+    design.add_argument("--limits", metavar="FILE", help="yml file with the limits of the machine")
+    design.add_argument(
+        "--recordings", type=int, default=1, help="number of recordings to design; default: 1"
+    )
+    design.add_argument(
+        "--seconds", type=float, default=10.0, help="length of a recording [s]; default: 10"
+    )
+    gain = command.add_argument_group(
+        "policy gain", "returns on the real system of policies trained in each twin"
+    )
+    gain.add_argument("--env", help="id of the real system")
+    gain.add_argument(
+        "--env-kwargs",
+        nargs="*",
+        default=[],
+        metavar="NAME:VALUE",
+        help="arguments of the environment",
+    )
+    gain.add_argument("--algo", default="hds", help="id of the algorithm in the zoo; default: hds")
+    gain.add_argument("--policies", type=int, default=5, help="policies per twin; default: 5")
+    gain.add_argument("--policy-budget", type=int, default=0, help="training steps per policy")
+    gain.add_argument("--episodes", type=int, default=20, help="episodes per policy; default: 20")
+    gain.add_argument(
+        "--hyperparams", nargs="*", default=[], metavar="NAME:VALUE", help="hyperparameters"
+    )
+    command.set_defaults(run=run)
+
+
 def run(given: argparse.Namespace) -> None:
-    """Load, diagnose, and report: on the screen, as a page, as JSON."""
+    """Load the data, diagnose, and report on the screen, as a page and as JSON."""
     from sb3_hds.data import audit
     from sb3_hds.effects import ALL
     from sb3_hds.sysid import diagnose
 
     _check_targets(given)
-    twin, data = measured.question(given)
-    measure = None if given.env is None else _policy_question(given, twin)
+    twin, data = measured.twin_and_data(given)
+    measure = None if given.env is None else _policy_comparison(given, twin)
     corrections: tuple[str, ...] = ()
     if given.correct:
         checked = audit(data, twin=twin)
@@ -43,11 +94,11 @@ def run(given: argparse.Namespace) -> None:
     print(found)
     plain, gain = found.to_dict(), None
     if measure is not None and found.twin.values == found.believed.values:
-        print("The twin is left as it was, so there are no policies to compare.")
+        print("The twin is unchanged, so there are no policies to compare.")
     elif measure is not None:
-        bought = measure(found)
-        print(bought)
-        plain["policy_gain"] = gain = bought.to_dict()
+        comparison = measure(found)
+        print(comparison)
+        plain["policy_gain"] = gain = comparison.to_dict()
     if given.json:
         measured.write_json(given.json, plain)
     measured.write_twin(given, found.twin)
@@ -55,37 +106,33 @@ def run(given: argparse.Namespace) -> None:
         print("Nothing was simulated, so there is no film.")
     elif given.animate:
         print(f"The film is {found.to_film(given.animate)}.")
-    experiment = _next(given, found)
+    experiment = _next_experiment(given, found)
     if given.report:
         print(f"The report is {found.to_html(given.report, gain, experiment)}.")
 
 
-def _next(given: argparse.Namespace, found: "Diagnosis") -> "NextExperiment | None":
-    """Design what ``--next`` asks for, print it and write its commands."""
+def _next_experiment(given: argparse.Namespace, found: "Diagnosis") -> "NextExperiment | None":
+    """Design the experiment of ``--next``, print it and write its commands."""
     if not given.next:
         return None
     if found.opened is None:
-        print("No cause was looked for, so there is nothing to record next.")
+        print("No cause was searched for, so there is no next experiment to design.")
         return None
-    told = found.next_experiment(
+    experiment = found.next_experiment(
         given.limits,
         n=given.recordings,
         seconds=given.seconds,
         seed=given.seed,
         progress=sys.stderr.isatty(),
     )
-    print(told)
-    print(f"The commands are {told.save(given.next)}.")
-    return told
+    print(experiment)
+    print(f"The commands are {experiment.save(given.next)}.")
+    return experiment
 
 
 def _check_targets(given: argparse.Namespace) -> None:
-    """Fail early: check everything that would fail after the diagnosis."""
-    from sb3_hds.core.trajectories.storage import check_target
-
-    for target in filter(None, (given.json, given.write)):
-        check_target(target)
-    measured.check_write(given)
+    """Check before the diagnosis everything that could fail after it."""
+    measured.check_targets(given)
     if given.animate:
         from sb3_hds.sysid.reporting.film import check_film
 
@@ -100,26 +147,24 @@ def _check_targets(given: argparse.Namespace) -> None:
 
 
 def _check_next(given: argparse.Namespace) -> None:
-    from sb3_hds.errors import ParameterError
     from sb3_hds.sysid.design import Limits
     from sb3_hds.sysid.design.result import check_file
 
     check_file(given.next)
     if not given.limits:
         raise ParameterError(
-            "--next chooses commands for a real machine: say what it may do, --limits limits.yml "
+            "--next designs commands for a real machine: give its limits, --limits limits.yml, "
             "with lines such as 'velocity: 6.0' or 'torque: {shoulder: 2.0}'."
         )
     Limits.of(given.limits)
 
 
-def _policy_question(
+def _policy_comparison(
     given: argparse.Namespace, twin: "Twin"
 ) -> "Callable[[Diagnosis], PolicyGain]":
-    """The comparison of policies, to be run on a diagnosis; its arguments are checked now."""
+    """Check the arguments of the policy comparison; return the function that runs it."""
     import gymnasium
 
-    from sb3_hds.errors import ParameterError
     from sb3_hds.experiments import measure_policy_gain
     from sb3_hds.experiments.policy_gain import check_question
 

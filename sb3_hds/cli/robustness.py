@@ -5,26 +5,38 @@ import csv
 import functools
 import io
 import sys
-from pathlib import Path
-from typing import Any
 
-from sb3_hds.cli.classes import algorithm, wrapped, wrapper
-from sb3_hds.cli.settings import yml_setting
+from sb3_hds.cli import policies
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """:param command: ``sb3-hds robustness``"""
+    command.add_argument(
+        "--algo", required=True, help="id in the zoo, ours or rl_zoo3's, or a class such as sbx.SAC"
+    )
+    command.add_argument("--model", required=True, help="file of the saved model")
+    policies.add_env(command, "environment id")
+    command.add_argument(
+        "--episodes", type=int, default=20, help="episodes per perturbation; default: 20"
+    )
+    command.add_argument("--encoders", choices=("own", "observation"), default="own")
+    command.add_argument("--vecnormalize", help="vecnormalize.pkl from the training")
+    command.add_argument("--push", type=float, default=5.0, help="force on the torso [N]")
+    command.add_argument("--csv", help="CSV file to write")
+    command.set_defaults(run=run)
 
 
 def run(given: argparse.Namespace) -> None:
-    """Measure the return of a policy under disturbances: on the screen, as a table."""
+    """Measure the return of a policy under disturbances; print it and write a table."""
     from sb3_hds.core.trajectories.storage import write_bytes
     from sb3_hds.experiments import PERTURBATIONS, measure_robustness
 
     changed = {name: dict(settings) for name, settings in PERTURBATIONS.items()}
     changed["push"]["push"] = given.push
-    kwargs = dict(map(yml_setting, given.env_kwargs))
-    wrap = functools.partial(wrapped, [wrapper(text) for text in given.env_wrapper])
     found = measure_robustness(
-        _loaded(given.algo, given.model),
-        functools.partial(_made, given.env, kwargs),
-        wrapper=wrap,
+        policies.load_policy(given.model, given.algo),
+        functools.partial(policies.bare_environment, given),
+        wrapper=functools.partial(policies.wrapped, given),
         perturbations=changed,
         n_episodes=given.episodes,
         encoders=given.encoders,
@@ -38,32 +50,3 @@ def run(given: argparse.Namespace) -> None:
         table.writeheader()
         table.writerows(rows)
         write_bytes(given.csv, lines.getvalue().encode())
-
-
-def _loaded(name: str, path: str) -> Any:
-    """
-    :raises FileNotFoundError: for a file that there is not, with the nearest that there is
-    :raises ParameterError: for a file that holds no model of that algorithm
-    """
-    from sb3_hds.errors import ParameterError, did_you_mean
-
-    kind, file = algorithm(name), Path(path)
-    if not file.is_file() and not file.with_name(f"{file.name}.zip").is_file():
-        beside = [str(found) for found in file.parent.glob("*.zip")]
-        raise FileNotFoundError(f"There is no model '{path}'.{did_you_mean(path, beside)}")
-    try:
-        return kind.load(path)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        why = str(error).strip().partition("\n")[0]
-        raise ParameterError(f"{path} holds no model of {name}: {why}") from error
-
-
-def _made(env_id: str, kwargs: dict[str, Any]) -> Any:
-    import gymnasium
-
-    from sb3_hds.errors import EnvironmentMismatchError
-
-    try:
-        return gymnasium.make(env_id, **kwargs)
-    except (gymnasium.error.Error, TypeError) as error:
-        raise EnvironmentMismatchError(f"There is no '{env_id}' with {kwargs}: {error}") from error

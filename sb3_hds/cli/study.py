@@ -10,46 +10,54 @@ if TYPE_CHECKING:
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """:param command: that is to understand them"""
+    """:param command: ``sb3-hds study``"""
     parts = command.add_subparsers(dest="part", required=True, metavar="part")
-    for name, told in (
-        ("run", "run what is not complete; once more after an interruption"),
-        ("status", "a table of its runs, and the time to go"),
-        ("report", "one page of HTML, with figures"),
+    for name, explained in (
+        ("run", "run what is not complete; resumes after an interruption"),
+        ("status", "print a table of the runs and the remaining time"),
+        ("report", "write an HTML page with figures"),
     ):
-        part = parts.add_parser(name, help=told)
-        part.add_argument("study", metavar="STUDY.yml", help="algorithms, envs, seeds, budget")
+        part = parts.add_parser(name, help=explained)
         part.add_argument(
-            "--folder", help="the zoo's folder of logs; default: logs/ and the name of the study"
+            "study", metavar="STUDY.yml", help="file with algorithms, envs, seeds and budget"
+        )
+        part.add_argument(
+            "--folder", help="the zoo's log folder; default: logs/ and the name of the study"
         )
         if name != "report":
-            part.add_argument("--jobs", type=int, help="runs at a time; default: one for each core")
+            part.add_argument("--jobs", type=int, help="parallel runs; default: one per core")
         if name == "run":
             part.add_argument(
-                "--memory", type=float, default=2.0, help="that a run may need [GiB]; default: 2"
+                "--memory", type=float, default=2.0, help="memory per run [GiB]; default: 2"
             )
             part.add_argument(
                 "--checkpoint",
                 type=float,
                 default=5.0,
                 metavar="MINUTES",
-                help="from one checkpoint of a run to the next; 0: none; default: 5",
+                help="interval between checkpoints of a run; 0: none; default: 5",
             )
             part.add_argument(
-                "--ray", metavar="ADDRESS", help="run on a Ray cluster: its address, or auto"
+                "--ray", metavar="ADDRESS", help="run on the Ray cluster at this address, or auto"
             )
             part.add_argument(
-                "--cpus", type=float, default=1.0, help="of a run, with --ray; default: 1"
+                "--cpus", type=float, default=1.0, help="cores per run, with --ray; default: 1"
             )
             part.add_argument(
-                "--gpus", type=float, default=0.0, help="of a run, with --ray; may be a fraction"
+                "--gpus",
+                type=float,
+                default=0.0,
+                help="GPUs per run, with --ray; may be a fraction",
             )
         if name == "report":
-            part.add_argument("--html", help="page to write; default: report.html in the folder")
+            part.add_argument(
+                "--html", help="page to write; default: report.html in the log folder"
+            )
+    command.set_defaults(run=run)
 
 
 def run(given: argparse.Namespace) -> int:
-    """:return: 1 where a run failed"""
+    """:return: 1 if a run failed, else 0"""
     from sb3_hds.experiments.study import Study
 
     study = Study.load(given.study)
@@ -82,14 +90,14 @@ def _status(study: "Study", folder: Path, given: argparse.Namespace) -> int:
 
     progress = progress_of(study, folder)
     table = Table("algorithm", "environment", "seed", "state", "steps", "wall time", box=None)
-    for one in progress:
-        share = f"{one.steps:,}" + (f" of {study.steps:,}" if study.steps else "")
-        run = one.run
-        table.add_row(run.label, run.env, str(run.seed), one.state, share, _time(one.seconds))
+    for row in progress:
+        share = f"{row.steps:,}" + (f" of {study.steps:,}" if study.steps else "")
+        run = row.run
+        table.add_row(run.label, run.env, str(run.seed), row.state, share, _time(row.seconds))
     Console().print(table)
-    complete = sum(one.state == "complete" for one in progress)
-    left = seconds_to_go(study, progress, given.jobs or os.cpu_count() or 1)
-    to_go = "" if left is None else f", about {_time(left)} to go"
+    complete = sum(row.state == "complete" for row in progress)
+    remaining = seconds_to_go(study, progress, given.jobs or os.cpu_count() or 1)
+    to_go = "" if remaining is None else f", about {_time(remaining)} to go"
     print(f"{complete} of {len(progress)} runs are complete{to_go}")
     return 0
 
@@ -98,7 +106,7 @@ def _report(study: "Study", folder: Path, given: argparse.Namespace) -> int:
     from sb3_hds.experiments.study import write_report
 
     written = write_report(study, folder, given.html or folder / "report.html")
-    print(f"{written.page}: {written.n_runs} runs, and {len(written.figures)} files of figures")
+    print(f"{written.page}: {written.n_runs} runs and {len(written.figures)} figure files")
     return 0
 
 

@@ -1,5 +1,5 @@
 """
-Policies on a robot: an ONNX file that needs no learning library, and a header of C.
+Policies on a robot: an ONNX file that needs no learning library, and a C header.
 
 Names are imported on first use: running a file imports neither jax nor torch.
 """

@@ -17,9 +17,9 @@ from sb3_hds.deploy.c_operations import Translation
 from sb3_hds.deploy.onnx_policy import OnnxPolicy
 from sb3_hds.errors import ExportError
 
-#: calls that are compared, and timed
+#: number of calls that are compared, and timed
 N_CHECKED, N_TIMED = 1_000, 20_000
-#: largest difference to onnxruntime, in halves of the range of each action
+#: largest difference to onnxruntime, relative to half the range of each action
 TOLERANCE = 1e-5
 _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wno-unused-function", "-pedantic", "-Werror")
 
@@ -27,16 +27,16 @@ _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wno-unused-function", "-pedan
 @dataclasses.dataclass(frozen=True)
 class Header:
     """
-    What was written.
+    A C header.
 
     :param path: of the header
-    :param n_bytes: its size as text
-    :param constant_bytes: weights and other constants
-    :param stack_bytes: what one call needs
-    :param n_operations: multiplications, additions and functions of one call
-    :param largest_error: against onnxruntime, in halves of the ranges; None: no compiler was found
-    :param median: of one call on this machine [s]; None likewise
-    :param worst: likewise
+    :param n_bytes: size of its text
+    :param constant_bytes: of weights and other constants
+    :param stack_bytes: used by one call
+    :param n_operations: multiplications, additions and functions in one call
+    :param largest_error: relative to onnxruntime and half the range; None: no compiler was found
+    :param median: time of one call on this machine [s]; None: no compiler was found
+    :param worst: longest time of one call [s]; None: no compiler was found
     """
 
     path: Path
@@ -55,7 +55,7 @@ class Header:
             f"{self.n_operations:,} operations",
         ]
         if self.largest_error is None:
-            lines.append("  not compiled: there is no command cc here")
+            lines.append("  not compiled: there is no command cc")
             return "\n".join(lines)
         assert self.median is not None and self.worst is not None
         lines.append(
@@ -75,16 +75,16 @@ def export_c(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> He
     loops without Python. Where there is a command ``cc``, the header is compiled, compared with
     onnxruntime on 1,000 observations and timed before it is written.
 
-    ``NAME_step(observation, ..., action)`` computes one action, with the memory in a ``NAME_state``
-    that ``NAME_reset`` begins, where there is some; NAME is that of the header. With
-    ``-DNAME_MAIN``, in capitals, there is a ``main`` that reads observations from standard input,
-    and then joints where the policy reads some, and prints actions.
+    ``NAME_step(observation, ..., action)`` computes one action, where NAME is that of the header.
+    Its memory, if any, is in a ``NAME_state`` that ``NAME_reset`` initialises. With
+    ``-DNAME_MAIN``, in capitals, there is a ``main`` that reads observations, and joints if the
+    policy reads some, from standard input and prints actions.
 
     :param source: the ONNX file
-    :param path: of the header; a file of that name is replaced
-    :return: what was written
-    :raises ExportError: for an operation without a translation, or a header that computes something
-        else
+    :param path: of the header; an existing file is replaced
+    :return: the header
+    :raises ExportError: for an operation without a translation, or a header that disagrees with
+        onnxruntime
     :raises ImportError: without the extra ``onnx``
     """
     try:
@@ -95,7 +95,8 @@ def export_c(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> He
         ) from error
     policy = OnnxPolicy(source)
     name = _identifier(Path(path).stem)
-    translation = Translation(onnx.load(os.fspath(source)), _inputs(policy))
+    shapes = {port: (1, *shape) for port, shape in policy._shapes.items()}
+    translation = Translation(onnx.load(os.fspath(source)), shapes)
     text = _header(name, policy, translation, Path(source).name)
     header = Header(
         Path(path),
@@ -106,11 +107,11 @@ def export_c(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> He
     )
     compiler = shutil.which("cc")
     if compiler is not None:
-        error, median, worst = _checked(compiler, name, text, policy)
+        error, median, worst = _checked(compiler, name, text, policy, translation)
         if not error <= TOLERANCE:
             raise ExportError(
-                f"The header would compute something else: actions differ from onnxruntime by "
-                f"{error:.1e} of half their range, and {TOLERANCE:g} is allowed. Nothing was "
+                "The header would not compute what the file does: actions differ from onnxruntime "
+                f"by {error:.1e} of half their range, and {TOLERANCE:g} is allowed. Nothing was "
                 "written."
             )
         header = dataclasses.replace(header, largest_error=error, median=median, worst=worst)
@@ -120,25 +121,20 @@ def export_c(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> He
 
 def _identifier(stem: str) -> str:
     """
-    :raises ExportError: for a name that C does not take
+    :raises ExportError: for a name that is no identifier in C
     """
     found = re.sub(r"\W", "_", stem, flags=re.ASCII)
     if not re.match(r"[A-Za-z_]", found):
         raise ExportError(
-            f"The name of a header becomes that of its functions, and C has no '{stem}': begin it "
-            "with a letter."
+            f"The name of a header becomes that of its functions, and '{stem}' is no name in C: "
+            "begin it with a letter."
         )
     return found
 
 
-def _inputs(policy: OnnxPolicy) -> dict[str, tuple[int, ...]]:
-    """Shapes of the inputs, for a batch of one."""
-    return {name: (1, *policy._shapes[name]) for name in policy._dtypes}
-
-
 def _header(name: str, policy: OnnxPolicy, translation: Translation, source: str) -> str:
-    told, upper = policy.metadata, name.upper()
-    memory = {part["input"]: part for part in told["memory"]}
+    metadata, upper = policy.metadata, name.upper()
+    memory = {part["input"]: part for part in metadata["memory"]}
     own = [port for port in translation.inputs if port not in memory]
     action = translation.outputs["action"]
     state = bool(memory)
@@ -147,16 +143,16 @@ def _header(name: str, policy: OnnxPolicy, translation: Translation, source: str
     arguments = ", ".join([*given, *state_argument, f"{translation.kind(action)} *action"])
     described = [
         f" *   {port}: {translation.size(port)} x {translation.kind(port)}"
-        + _channels(told["observations"].get(port, ()))
+        + _channels(metadata["observations"].get(port, ()))
         for port in own
     ]
     described.append(
         f" *   action: {translation.size(action)} x {translation.kind(action)}"
-        + _channels(told["actions"])
+        + _channels(metadata["actions"])
     )
     lines = [
-        f"/* {told['algorithm']}, from {source}, weights {told['weights_sha256'][:16]}.",
-        f" * A step is {told['dt']} s long." if told["dt"] else " * The step is not known.",
+        f"/* {metadata['algorithm']}, from {source}, weights {metadata['weights_sha256'][:16]}.",
+        f" * A step is {metadata['dt']} s long." if metadata["dt"] else " * The step is not known.",
         *described,
         f" * cc -std=c99 -O2 -D{upper}_MAIN -x c {name}.h -lm -o {name}",
         " */",
@@ -173,7 +169,7 @@ def _header(name: str, policy: OnnxPolicy, translation: Translation, source: str
     if state:
         lines += [
             "typedef struct {",
-            *(f"    {translation.kind(p)} {p}[{translation.size(p)}];" for p in memory),
+            *(f"    {translation.declared(port, port)}" for port in memory),
             f"}} {name}_state;",
             "",
             f"static void {name}_reset({name}_state *state) {{",
@@ -200,24 +196,21 @@ def _header(name: str, policy: OnnxPolicy, translation: Translation, source: str
 
 
 def _channels(channels: Sequence[Mapping[str, Any]]) -> str:
-    told = [f"{c['name']} [{c['unit']}]" if c.get("unit") else c["name"] for c in channels]
-    text = f" ({', '.join(told)})" if told else ""
+    names = [f"{c['name']} [{c['unit']}]" if c.get("unit") else c["name"] for c in channels]
+    text = f" ({', '.join(names)})" if names else ""
     return text.replace("*/", "* /")
 
 
 def _main(
     name: str, translation: Translation, own: Sequence[str], action: str, state: bool
 ) -> list[str]:
-    upper, whole = name.upper(), translation.kind(action) in ("int", "long long")
+    upper, is_integer = name.upper(), translation.kind(action) in ("int", "long long")
     symbols = [translation.symbol(port) for port in own]
     call = ", ".join([*symbols, *(["&state"] if state else []), "action"])
-    printed = '"%lld%c", (long long)action[i]' if whole else '"%.9g%c", (double)action[i]'
+    printed = '"%lld%c", (long long)action[i]' if is_integer else '"%.9g%c", (double)action[i]'
     lines = [f"#ifdef {upper}_MAIN", "#include <stdio.h>", "", "int main(void) {"]
-    lines += [
-        f"    static {translation.kind(port)} {translation.symbol(port)}[{translation.size(port)}];"
-        for port in own
-    ]
-    lines += [f"    {translation.kind(action)} action[{translation.size(action)}];"]
+    lines += [f"    static {translation.declared(port)}" for port in own]
+    lines += [f"    {translation.declared(action, 'action')}"]
     lines += [f"    {name}_state state;", f"    {name}_reset(&state);"] * state
     lines += ["    double number;", "    int i;", "    for (;;) {"]
     for port in own:
@@ -241,12 +234,14 @@ def _main(
     return lines
 
 
-def _checked(compiler: str, name: str, text: str, policy: OnnxPolicy) -> tuple[float, float, float]:
-    """The largest error, and the median and the worst time of a call [s]."""
-    rng, shapes = np.random.default_rng(0), _inputs(policy)
+def _checked(
+    compiler: str, name: str, text: str, policy: OnnxPolicy, translation: Translation
+) -> tuple[float, float, float]:
+    """The largest error, and the median and the longest time of a call [s]."""
+    rng = np.random.default_rng(0)
     memory = {part["input"] for part in policy.metadata["memory"]}
-    own = [port for port in shapes if port not in memory]
-    rows = {port: _drawn(policy, port, shapes[port][1:], rng) for port in own}
+    own = [port for port in translation.inputs if port not in memory]
+    rows = {port: _drawn(policy, port, rng) for port in own}
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, f"{name}.h").write_text(text)
         _compile(compiler, folder, ["-x", "c", f"{name}.h", f"-D{name.upper()}_MAIN"], name)
@@ -254,56 +249,35 @@ def _checked(compiler: str, name: str, text: str, policy: OnnxPolicy) -> tuple[f
         given = "\n".join(" ".join(map(repr, row)) for row in flat.astype(float).tolist())
         found = _output([str(Path(folder, name))], given)
         found = np.array([list(map(float, line.split())) for line in found.splitlines()])
-        Path(folder, "timed.c").write_text(_timed(name, policy, shapes, own))
+        Path(folder, "timed.c").write_text(_timed(name, translation, own, bool(memory)))
         _compile(compiler, folder, ["-D_POSIX_C_SOURCE=199309L", "timed.c"], "timed")
         median, worst = map(float, _output([str(Path(folder, "timed"))], "").split())
     wanted, state = [], None
     for k in range(N_CHECKED):
-        one = {port: part[k] for port, part in rows.items()}
-        action, state = policy.predict(_observed(policy, one), state, joints=_joints(one))
+        now = {port: part[k] for port, part in rows.items()}
+        parts = {key: now[port] for port, key in policy._keys.items()}
+        observed = parts if all(parts) else next(iter(parts.values()))
+        joints = (now["joint_position"], now["joint_velocity"]) if policy.joints else None
+        action, state = policy.predict(observed, state, joints=joints)
         wanted.append(np.ravel(action))
-    differences = np.abs(found - np.array(wanted, float)) / _halves(policy)
+    ends = [(a.get("low"), a.get("high")) for a in policy.metadata["actions"]]
+    halves = np.array([1.0 if None in e else 0.5 * (e[1] - e[0]) for e in ends])
+    differences = np.abs(found - np.array(wanted, float)) / halves
     return float(differences.max()), median, worst
 
 
-def _drawn(
-    policy: OnnxPolicy, port: str, shape: tuple[int, ...], rng: np.random.Generator
-) -> np.ndarray:
+def _drawn(policy: OnnxPolicy, port: str, rng: np.random.Generator) -> np.ndarray:
+    shape = (N_CHECKED, *policy._shapes[port])
     if issubclass(policy._dtypes[port], np.integer):
-        return rng.integers(0, 2, (N_CHECKED, *shape))
-    return (2.0 * rng.standard_normal((N_CHECKED, *shape))).astype(np.float32)
+        return rng.integers(0, 2, shape)
+    return (2.0 * rng.standard_normal(shape)).astype(np.float32)
 
 
-def _observed(policy: OnnxPolicy, one: Mapping[str, np.ndarray]) -> Any:
-    parts = {key: one[port] for port, key in policy._keys.items()}
-    return parts if all(parts) else next(iter(parts.values()))
-
-
-def _joints(one: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
-    if "joint_position" not in one:
-        return None
-    return one["joint_position"], one["joint_velocity"]
-
-
-def _halves(policy: OnnxPolicy) -> np.ndarray:
-    ends = [(a.get("low"), a.get("high")) for a in policy.metadata["actions"]]
-    return np.array([1.0 if None in e else 0.5 * (e[1] - e[0]) for e in ends])
-
-
-def _timed(
-    name: str, policy: OnnxPolicy, shapes: Mapping[str, tuple[int, ...]], own: Sequence[str]
-) -> str:
-    """A program that prints the median and the worst time of a call [s]."""
-    kinds = {np.float32: "float", np.float64: "double", np.int64: "long long", np.int32: "int"}
-    state = bool(policy.metadata["memory"])
-    symbols = [_identifier(port) for port in own]
-    declared = "".join(
-        f"    static {kinds[policy._dtypes[port]]} {symbol}[{int(np.prod(shapes[port]))}];\n"
-        for port, symbol in zip(own, symbols, strict=True)
-    )
-    # The kind of the first output is that of the action.
-    kind = policy._session.get_outputs()[0].type
-    action = {"tensor(float)": "float", "tensor(double)": "double", "tensor(int64)": "long long"}
+def _timed(name: str, translation: Translation, own: Sequence[str], state: bool) -> str:
+    """A program that prints the median and the longest time of a call [s]."""
+    symbols = [translation.symbol(port) for port in own]
+    declared = "".join(f"    static {translation.declared(port)}\n" for port in own)
+    action = translation.declared(translation.outputs["action"], "action")
     call = ", ".join([*symbols, *(["&state"] if state else []), "action"])
     return f"""#include <stdio.h>
 #include <stdlib.h>
@@ -315,12 +289,12 @@ static int compare(const void *a, const void *b) {{
 }}
 int main(void) {{
     static double seconds[{N_TIMED}];
-{declared}    static {action.get(kind, "int")} action[{name.upper()}_N_ACTION];
+{declared}    static {action}
     {f"{name}_state state; {name}_reset(&state);" if state else ""}
     struct timespec begin, end;
     int k;
     for (k = 0; k < {N_TIMED}; ++k) {{
-        {symbols[0]}[0] = ({kinds[policy._dtypes[own[0]]]})(k % 2);
+        {symbols[0]}[0] = ({translation.kind(own[0])})(k % 2);
         clock_gettime(CLOCK_MONOTONIC, &begin);
         {name}_step({call});
         clock_gettime(CLOCK_MONOTONIC, &end);

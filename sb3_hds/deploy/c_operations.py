@@ -1,4 +1,4 @@
-"""Operations of ONNX as statements of C, for a batch of one, with all shapes known."""
+"""ONNX operations as C statements, for a batch of one and known shapes."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,10 +18,9 @@ from sb3_hds.deploy.c_text import (
     over_last,
     place_of,
 )
-from sb3_hds.deploy.conversion import attributes_of, evaluated, numpy_type
 from sb3_hds.errors import ExportError
 
-# What only moves numbers: its effect on their places is found by moving the places themselves.
+# Operations that only move numbers: applied to indices, they show which number goes where.
 _MOVES = {
     "Concat",
     "Expand",
@@ -39,27 +38,31 @@ _MOVES = {
 
 class Translation:
     """
+    The C code of an ONNX model.
+
     :param proto: an ``onnx.ModelProto``
     :param shapes: of its inputs, with a leading axis of one
-    :raises ExportError: for an operation that has no translation
+    :raises ExportError: for an operation without a translation
     """
 
     def __init__(self, proto: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        from onnx import numpy_helper
+        from onnx import helper, numpy_helper
         from onnx.reference import ReferenceEvaluator
 
         self._opset = list(proto.opset_import)
         graph = proto.graph
-        held = {part.name: numpy_helper.to_array(part) for part in graph.initializer}
+        weights = {part.name: numpy_helper.to_array(part) for part in graph.initializer}
         zeros = {
-            port.name: np.zeros(shapes[port.name], numpy_type(port.type.tensor_type.elem_type))
+            port.name: np.zeros(
+                shapes[port.name], helper.tensor_dtype_to_np_dtype(port.type.tensor_type.elem_type)
+            )
             for port in graph.input
         }
         with np.errstate(all="ignore"):
             values = ReferenceEvaluator(proto).run(None, zeros, intermediate=True)
-        found: dict[str, Any] = {**held, **zeros, **values}  # type: ignore[dict-item]
+        found: dict[str, Any] = {**weights, **zeros, **values}  # type: ignore[dict-item]
         self._values = {name: np.asarray(value) for name, value in found.items() if name}
-        self._constant = set(held)
+        self._constant = set(weights)
         self.inputs = list(zeros)
         self.outputs = {port.name: port.name for port in graph.output}
         self._symbols: dict[str, str] = {}
@@ -75,14 +78,14 @@ class Translation:
         for node in self._needed(graph):
             self._translate(node)
 
-    # --- what the header asks for
+    # --- parts of the header
 
     def kind(self, name: str) -> str:
-        """:return: the type of C of an array"""
+        """:return: the C type of an array"""
         return KINDS[self._values[name].dtype.name]
 
     def size(self, name: str) -> int:
-        """:return: how many numbers it has"""
+        """:return: its number of elements"""
         return int(self._values[name].size)
 
     def symbol(self, name: str) -> str:
@@ -92,15 +95,19 @@ class Translation:
             return re.sub(r"\W", "_", name, flags=re.ASCII)
         return self._symbols.setdefault(name, f"v{len(self._symbols)}")
 
+    def declared(self, name: str, symbol: str | None = None) -> str:
+        """:return: its declaration in C; default: by its own symbol"""
+        return f"{self.kind(name)} {symbol or self.symbol(name)}[{self.size(name)}];"
+
     @property
     def constant_bytes(self) -> int:
-        """Of weights and tables."""
+        """Size of weights and tables."""
         weights = sum(self._values[name].nbytes for name in self._used)
         return int(weights + 4 * sum(table.size for table in self._tables.values()))
 
     @property
     def stack_bytes(self) -> int:
-        """Of all that is computed in a call."""
+        """Size of all buffers of a call."""
         return int(sum(self._values[name].nbytes for name in self._buffers))
 
     def constants(self, prefix: str) -> list[str]:
@@ -114,12 +121,8 @@ class Translation:
 
     def body(self, prefix: str) -> list[str]:
         """:return: the statements of a call"""
-        names = [self.symbol(name) for name in self._used] + list(self._tables)
-        own = {f"@{symbol}@": f"{prefix}_{symbol}" for symbol in names}
-        declared = [
-            f"{self.kind(name)} {self.symbol(name)}[{self.size(name)}];" for name in self._buffers
-        ]
-        statements = [re.sub(r"@\w+@", lambda m: own[m[0]], line) for line in self._statements]
+        declared = map(self.declared, self._buffers)
+        statements = [re.sub(r"@(\w+)@", rf"{prefix}_\1", line) for line in self._statements]
         idle = [f"(void){name};" for name in ("i", "j", "k", *map(self.symbol, self.inputs))]
         return ["int i = 0, j = 0, k = 0;", *declared, *idle, *statements]
 
@@ -127,10 +130,10 @@ class Translation:
         """:return: statements that copy an array"""
         return [f"for (i = 0; i < {self.size(name)}; ++i) {target}[i] = {self._read(name)}[i];"]
 
-    # --- one operation after the other
+    # --- translation of single operations
 
     def _needed(self, graph: Any) -> list[Any]:
-        """The operations that the outputs depend on, in their order; not those on constants."""
+        """The operations that the outputs depend on, in order, without those on constants."""
         wanted, found = {port.name for port in graph.output}, []
         for node in reversed(graph.node):
             if wanted & set(node.output) - self._constant:
@@ -141,7 +144,7 @@ class Translation:
     def _translate(self, node: Any) -> None:
         inputs = [name for name in node.input if name]
         kind = node.op_type
-        attributes = attributes_of(node)
+        attributes = _attributes_of(node)
         if not any(map(self.size, node.output)):
             return
         if kind in _MOVES:
@@ -169,12 +172,12 @@ class Translation:
             self._over_last(node, inputs)
         else:
             raise ExportError(
-                f"The operation {kind} of ONNX has no translation to C here. Run the ONNX file "
+                f"The operation {kind} of ONNX has no translation to C. Run the ONNX file "
                 "itself, or use another activation function."
             )
 
     def _read(self, name: str) -> str:
-        """A constant, or a buffer."""
+        """The symbol of a constant or a buffer."""
         name = self._alias.get(name, name)
         if name in self._constant:
             self._used[name] = None
@@ -186,7 +189,7 @@ class Translation:
         return self.symbol(name)
 
     def _index(self, shape: tuple[int, ...], name: str, index: str = "i") -> str:
-        """Where a number of the result finds that of an input, as both are broadcast."""
+        """Index into an input for element ``index`` of the result, under broadcasting."""
         value = self._values[name]
         places = np.arange(value.size).reshape(value.shape)
         table = np.broadcast_to(places, shape).ravel()
@@ -213,10 +216,7 @@ class Translation:
         shape = self._values[output].shape
         single = all(self._values[name].dtype != np.float64 for name in inputs)
         read = [self._at(shape, name) for name in inputs]
-        text = expression.replace("{f}", "f" if single else "")
-        for i, part in enumerate(read):
-            text = text.replace(f"{{{i}}}", part)
-        self._loop(output, text)
+        self._loop(output, expression.format(*read, f="f" if single else ""))
 
     def _loop(self, output: str, text: str) -> None:
         n = self.size(output)
@@ -227,18 +227,17 @@ class Translation:
         )
 
     def _folded(self, output: str, first: str, others: Iterable[tuple[str, str]]) -> None:
-        """:param others: inputs, and the expression by which each is added to what is before it"""
+        """:param others: inputs, and the expression that combines each with the result so far"""
         shape = self._values[output].shape
         text = self._at(shape, first)
         for name, expression in others:
-            other = self._at(shape, name)
-            text = "(" + expression.replace("{0}", text).replace("{1}", other) + ")"
+            text = f"({expression.format(text, self._at(shape, name))})"
         self._loop(output, text)
 
     def _move(self, node: Any, inputs: Sequence[str]) -> None:
         data = inputs if node.op_type == "Concat" else inputs[:1]
         if any(name not in self._constant for name in inputs if name not in data):
-            raise ExportError(f"{node.op_type} by a computed index has no translation to C here.")
+            raise ExportError(f"{node.op_type} by a computed index has no translation to C.")
         first, given = 0, []
         for name in inputs:
             value = self._values[name]
@@ -248,10 +247,10 @@ class Translation:
             else:
                 given.append(value)
         ends = np.cumsum([0, *(self.size(name) for name in data)])
-        for output, places in zip(node.output, evaluated(node, given, self._opset), strict=True):
+        for output, places in zip(node.output, _evaluated(node, given, self._opset), strict=True):
             table = np.asarray(places).ravel()
-            whole = table.size and np.array_equal(table, np.arange(ends[1]))
-            if whole and len(data) == 1:
+            unchanged = table.size and np.array_equal(table, np.arange(ends[1]))
+            if unchanged and len(data) == 1:
                 self._alias[output] = self._alias.get(data[0], data[0])
                 continue
             self._gather(output, table, data, ends)
@@ -259,7 +258,7 @@ class Translation:
     def _gather(
         self, output: str, table: np.ndarray, data: Sequence[str], ends: np.ndarray
     ) -> None:
-        """Runs of numbers that stay neighbours are copied by a loop each."""
+        """Copy each run of contiguous elements in a loop."""
         target = self._new(output)
         source = np.searchsorted(ends, table, side="right") - 1
         breaks = np.flatnonzero((np.diff(table) != 1) | (np.diff(source) != 0)) + 1
@@ -288,7 +287,7 @@ class Translation:
         alpha, beta = attributes.get("alpha", 1.0), attributes.get("beta", 1.0)
         bias = inputs[2] if node.op_type == "Gemm" and len(inputs) > 2 else None
         if "." in equation or len(equation.split("->")[0].split(",")) != 2 or alpha != 1.0:
-            raise ExportError(f"{node.op_type} ({equation}) has no translation to C here.")
+            raise ExportError(f"{node.op_type} ({equation}) has no translation to C.")
         self._contraction(output, equation, inputs[:2], bias, beta)
 
     def _contraction(
@@ -322,24 +321,18 @@ class Translation:
 
     def _reduce(self, node: Any, inputs: Sequence[str]) -> None:
         n_outer, n = self._last(node, inputs)
-        first, each, after = REDUCED[node.op_type]
         x = f"({self._read(inputs[0])} + j * {n})"
         fill = {"x": x, "v": f"{x}[k]", "n": str(n)}
-        self._rows(
-            node, n_outer, n, first.format(**fill), each.format(**fill), after.format(**fill)
-        )
-
-    def _rows(self, node: Any, n_outer: int, n: int, first: str, each: str, after: str) -> None:
-        output = node.output[0]
+        total, term, result = (text.format(**fill) for text in REDUCED[node.op_type])
         self.n_operations += n_outer * n
         self._statements.append(
-            f"for (j = 0; j < {n_outer}; ++j) {{ {self.kind(output)} total = {first}; "
-            f"for (k = 0; k < {n}; ++k) {each} {self._new(output)}[j] = {after}; }}"
+            f"for (j = 0; j < {n_outer}; ++j) {{ {self.kind(node.output[0])} total = {total}; "
+            f"for (k = 0; k < {n}; ++k) {term} {self._new(node.output[0])}[j] = {result}; }}"
         )
 
     def _last(self, node: Any, inputs: Sequence[str]) -> tuple[int, int]:
-        """How many rows, and how long they are, where an operation goes over the last axes."""
-        value, attributes = self._values[inputs[0]], attributes_of(node)
+        """Number of rows and their length, for an operation over the last axes."""
+        value, attributes = self._values[inputs[0]], _attributes_of(node)
         axes = attributes.get("axes", attributes.get("axis"))
         if len(inputs) > 1:
             axes = self._values[inputs[1]].ravel().tolist()
@@ -369,9 +362,30 @@ class Translation:
 
     def _over_last(self, node: Any, inputs: Sequence[str]) -> None:
         kind, output = node.op_type, node.output[0]
-        n_outer, n = (
-            self._last(node, inputs[:1]) if kind != "ReduceLogSumExp" else self._last(node, inputs)
-        )
+        n_outer, n = self._last(node, inputs)
         x, y = f"({self._read(inputs[0])} + j * {n})", self._new(output)
         self.n_operations += 3 * n_outer * n
         self._statements.append(over_last(kind, self.kind(inputs[0]), (n_outer, n), (x, y)))
+
+
+def _attributes_of(node: Any) -> dict[str, Any]:
+    from onnx import helper
+
+    found = {part.name: helper.get_attribute_value(part) for part in node.attribute}
+    return {k: v.decode() if isinstance(v, bytes) else v for k, v in found.items()}
+
+
+def _evaluated(node: Any, given: Sequence[np.ndarray], opset: Sequence[Any]) -> list[Any]:
+    """What an operation does to these arrays, by ONNX's reference implementation."""
+    from onnx import helper
+    from onnx.reference import ReferenceEvaluator
+
+    # Each input gets its own name, since a node may read one array twice.
+    names = [f"x{i}" if name else "" for i, name in enumerate(node.input)]
+    copy = type(node)()
+    copy.CopyFrom(node)
+    copy.input[:] = names
+    used = [name for name in names if name]
+    function = helper.make_function("", "one", used, node.output, [copy], opset)
+    values = dict(zip(used, given, strict=True))
+    return ReferenceEvaluator(function).run(None, values, {})  # type: ignore[return-value]

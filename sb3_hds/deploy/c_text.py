@@ -14,7 +14,7 @@ KINDS = {
     "int32": "int",
     "bool": "unsigned char",
 }
-# Of one number each; {f}: the suffix of functions of single precision.
+# Elementwise operations; {f}: suffix of functions in single precision.
 EXPRESSIONS: dict[str, str] = {
     "Abs": "fabs{f}({0})",
     "Add": "{0} + {1}",
@@ -49,7 +49,7 @@ EXPRESSIONS: dict[str, str] = {
     "Tanh": "tanh{f}({0})",
     "Where": "{0} ? {1} : {2}",
 }
-# Of any number of inputs, by that of two.
+# Operations on any number of inputs, as an expression of two.
 FOLDED = {"Max": "{0} > {1} ? {0} : {1}", "Min": "{0} < {1} ? {0} : {1}"}
 REDUCED = {
     "ReduceMax": ("{x}[0]", "total = {v} > total ? {v} : total;", "total"),
@@ -58,7 +58,7 @@ REDUCED = {
     "ReduceSum": ("0", "total += {v};", "total"),
     "ReduceSumSquare": ("0", "total += {v} * {v};", "total"),
 }
-# Weights in one line of the header.
+# Weights per line of the header.
 _PER_LINE = 8
 
 
@@ -80,7 +80,7 @@ def activation(kind: str, attributes: Mapping[str, Any]) -> str:
 
 
 def place_of(labels: str, shape: tuple[int, ...]) -> str:
-    """Of an entry among the numbers of an array, by the indices of its axes."""
+    """Offset of an element of an array, in terms of the indices of its axes."""
     parts, stride = [], 1
     for label, n in zip(reversed(labels), reversed(shape), strict=True):
         if n > 1:
@@ -109,7 +109,7 @@ def array_of(kind: str, symbol: str, values: np.ndarray) -> list[str]:
 
 def _literal(x: float, digits: int, suffix: str) -> str:
     """
-    :raises ExportError: for a weight that C has no literal for
+    :raises ExportError: for a weight that is NaN
     """
     if np.isinf(x):
         return f"{'-' if x < 0 else ''}HUGE_VAL{suffix.upper()}"
@@ -127,9 +127,9 @@ def layer_norm(
     epsilon: float,
 ) -> str:
     """
-    :param kind: type of C
+    :param kind: C type
     :param shape: rows, and numbers in each
-    :param names: of a row, and of the one that is written
+    :param names: of the input row, and of the output row
     :param weights: scale, and shift where there is one
     """
     (rows, n), (x, y) = shape, names
@@ -147,9 +147,9 @@ def layer_norm(
 def over_last(operation: str, kind: str, shape: tuple[int, int], names: tuple[str, str]) -> str:
     """
     :param operation: ``"ArgMax"``, ``"Softmax"`` or ``"ReduceLogSumExp"``
-    :param kind: type of C
+    :param kind: C type
     :param shape: rows, and numbers in each
-    :param names: of a row, and of the array that is written
+    :param names: of the input row, and of the output array
     """
     (rows, n), (x, y) = shape, names
     f = "f" if kind == "float" else ""

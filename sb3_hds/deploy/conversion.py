@@ -1,37 +1,27 @@
-"""Functions of JAX and modules of torch as ONNX models, by the converters of those libraries."""
+"""Functions of JAX and policies of torch as ONNX models, by the converters of those libraries."""
 
 import contextlib
 import io
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import torch as th
+from gymnasium import spaces
 from jax.extend.core import Literal
 
+from sb3_hds.deploy.observations import SINGLE, Normalization, Port, parts_of
 from sb3_hds.errors import ExportError
 
-#: of the operators, and of the file: onnxruntime 1.14 (February 2023) reads both
+#: versions of operators and file format, which onnxruntime 1.14 (February 2023) reads
 OPSET, IR_VERSION = 18, 8
 BATCH = "batch"
-# Calls whose content is evaluated in their place.
+# Calls to inline.
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
-
-
-class Port(NamedTuple):
-    """
-    An input or an output.
-
-    :param shape: without the axis of the batch
-    :param dtype: as NumPy names it
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    dtype: str
 
 
 def from_jax(
@@ -42,14 +32,17 @@ def from_jax(
     inlined: bool,
 ) -> Any:
     """
-    :param function: of arrays with a leading axis, to a tuple of those
-    :param inlined: whether jax2onnx sees single operations instead of layers of flax, which it
-        writes shorter, but can neither map nor evaluate in double precision
+    :param function: from arrays with a leading axis to a tuple of them
+    :param inlined: whether to convert single operations instead of layers of flax, which are
+        shorter, but support neither ``vmap`` nor double precision
     :return: an ``onnx.ModelProto``
-    :raises ExportError: for an operation that jax2onnx does not know
+    :raises ExportError: for an operation that jax2onnx does not support
     :raises ImportError: without the extra ``onnx``
     """
-    to_onnx = _jax2onnx()
+    try:
+        from jax2onnx import to_onnx
+    except ImportError as error:
+        raise _missing("jax2onnx") from error
     double = any(port.dtype == "float64" for port in inputs)
     with _quiet(), jax.enable_x64(double):
         batch = jax.export.symbolic_shape(BATCH)
@@ -68,27 +61,38 @@ def from_jax(
         except (NotImplementedError, KeyError) as error:
             reason = str(error).strip().partition("\n")[0]
             raise ExportError(
-                f"jax2onnx cannot convert this policy ({reason}). If it has an activation function "
-                "of your own, write it with functions of jax.numpy, or use one of jax.nn."
+                f"jax2onnx cannot convert this policy ({reason}). If it has a custom activation "
+                "function, write it with functions of jax.numpy, or use one of jax.nn."
             ) from error
 
 
-def from_torch(module: Any, inputs: Sequence[Port], outputs: Sequence[str]) -> Any:
+def from_torch(
+    policy: Any,
+    inputs: Sequence[Port],
+    outputs: Sequence[str],
+    by: Mapping[str, Normalization],
+) -> Any:
     """
-    :param module: a ``torch.nn.Module`` of arrays with a leading axis
+    :param policy: of Stable-Baselines3
+    :param inputs: one for each part of an observation
+    :param by: normalisation of its observations
     :return: an ``onnx.ModelProto``
-    :raises ExportError: for an operation that torch does not export
+    :raises ExportError: for an operation that torch cannot export
     :raises ImportError: without the extra ``onnx``
     """
-    import torch as th
-
-    onnx = _onnx()
+    try:
+        import onnx
+    except ImportError as error:
+        raise _missing("onnx") from error
+    policy.set_training_mode(False)
+    keys = list(parts_of(policy.observation_space))
+    module = _DeterministicPolicy(policy, keys, by)
     example = tuple(th.zeros((2, *p.shape), dtype=getattr(th, p.dtype)) for p in inputs)
     names = [port.name for port in inputs]
     file = io.BytesIO()
     with _quiet():
         try:
-            # The exporter that traces: torch.export refuses the checks of torch's distributions.
+            # The tracing exporter: torch.export fails at the checks in torch's distributions.
             th.onnx.export(
                 module.eval(),
                 example,
@@ -105,20 +109,36 @@ def from_torch(module: Any, inputs: Sequence[Port], outputs: Sequence[str]) -> A
     return onnx.load_from_string(file.getvalue())
 
 
-def _jax2onnx() -> Any:
-    try:
-        from jax2onnx import to_onnx
-    except ImportError as error:
-        raise _missing("jax2onnx") from error
-    return to_onnx
+class _DeterministicPolicy(th.nn.Module):
+    """
+    :param policy: of Stable-Baselines3
+    :param by: normalisation of its observations
+    """
 
+    def __init__(self, policy: Any, keys: Sequence[str], by: Mapping[str, Normalization]) -> None:
+        super().__init__()
+        self.policy, self.keys, self.by = policy, keys, by
+        self.space = policy.action_space
 
-def _onnx() -> Any:
-    try:
-        import onnx
-    except ImportError as error:
-        raise _missing("onnx") from error
-    return onnx
+    def forward(self, *inputs: th.Tensor) -> th.Tensor:
+        """:return: actions in the units of the action space"""
+        seen = {key: self._normalized(key, x) for key, x in zip(self.keys, inputs, strict=True)}
+        action = self.policy._predict(seen.get(SINGLE, seen), deterministic=True).reshape(
+            -1, *self.space.shape
+        )
+        if not isinstance(self.space, spaces.Box):
+            return action
+        low, high = th.as_tensor(self.space.low), th.as_tensor(self.space.high)
+        if self.policy.squash_output:
+            action = low + 0.5 * (action + 1.0) * (high - low)
+        return th.clamp(action, low, high)
+
+    def _normalized(self, key: str, values: th.Tensor) -> th.Tensor:
+        by = self.by.get(key)
+        if by is None:
+            return values
+        mean, scale = (th.as_tensor(part, dtype=values.dtype) for part in (by.mean, by.scale))
+        return th.clamp((values - mean) / scale, -by.clip, by.clip)
 
 
 def _missing(name: str) -> ImportError:
@@ -127,7 +147,7 @@ def _missing(name: str) -> ImportError:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Both converters report on standard output and by warnings what only they can change."""
+    """Silence the output and warnings of the converters, on which users cannot act."""
     loggers = [logging.getLogger(name) for name in ("jax2onnx", "onnx_ir", "onnx_ir.serde")]
     before = [logger.level for logger in loggers]
     for logger in loggers:
@@ -149,7 +169,7 @@ def _inlined(function: Callable[..., Any], given: Sequence[Any]) -> Callable[...
 
 def _evaluate(closed: Any, arguments: Sequence[Any]) -> list[Any]:
     """
-    What a traced function computes, in operations that are exact in the file: jax2onnx 0.17
+    Evaluate a traced function by operations that are exact in the file: jax2onnx 0.17
     converts ``rem`` for fixed shapes only (``ir.Shape`` of a symbolic batch, in its
     ``plugins/jax/lax/rem.py``), and onnxruntime has ``Atan`` in single precision only.
     """
@@ -177,49 +197,8 @@ def _evaluate(closed: Any, arguments: Sequence[Any]) -> list[Any]:
 
 
 def _double_atan2(y: jax.Array, x: jax.Array) -> jax.Array:
-    """From single precision by one step of Newton's method, whose error is cubic."""
-    rough = jnp.arctan2(y.astype(jnp.float32), x.astype(jnp.float32)).astype(jnp.float64)
+    """Refine single precision by one step of Newton's method, whose error is cubic."""
+    estimate = jnp.arctan2(y.astype(jnp.float32), x.astype(jnp.float32)).astype(jnp.float64)
     radius = jnp.sqrt(x * x + y * y)
-    away = (y * jnp.cos(rough) - x * jnp.sin(rough)) / jnp.where(radius > 0.0, radius, 1.0)
-    return rough + away
-
-
-# --- what ONNX says of its own operations
-
-
-def attributes_of(node: Any) -> dict[str, Any]:
-    """:return: of one operation, by name"""
-    from onnx import helper
-
-    found = {part.name: helper.get_attribute_value(part) for part in node.attribute}
-    return {k: v.decode() if isinstance(v, bytes) else v for k, v in found.items()}
-
-
-def numpy_type(kind: int) -> Any:
-    """:return: the type of NumPy of a type of ONNX"""
-    from onnx import helper
-
-    return helper.tensor_dtype_to_np_dtype(kind)
-
-
-def evaluated(node: Any, given: Sequence[np.ndarray], opset: Sequence[Any]) -> list[Any]:
-    """:return: what an operation does to these arrays, by ONNX's own reference"""
-    from onnx import TensorProto, helper
-    from onnx.reference import ReferenceEvaluator
-
-    names = [f"x{i}" for i in range(len(given))]
-    copy = type(node)()
-    copy.CopyFrom(node)
-    filled = iter(names)
-    inputs = [next(filled) if name else "" for name in node.input]
-    del copy.input[:]
-    copy.input.extend(inputs)
-    kind = TensorProto.INT64
-    graph = helper.make_graph(
-        [copy],
-        "one",
-        [helper.make_tensor_value_info(name, kind, None) for name in names],
-        [helper.make_tensor_value_info(name, kind, None) for name in node.output],
-    )
-    model = helper.make_model(graph, opset_imports=opset)
-    return ReferenceEvaluator(model).run(None, dict(zip(names, given, strict=True)))  # type: ignore[return-value]
+    error = (y * jnp.cos(estimate) - x * jnp.sin(estimate)) / jnp.where(radius > 0.0, radius, 1.0)
+    return estimate + error

@@ -1,5 +1,6 @@
-"""What an exported file says of itself."""
+"""The metadata of an exported file."""
 
+import contextlib
 import hashlib
 import json
 import math
@@ -11,8 +12,8 @@ import jax
 import numpy as np
 from gymnasium import spaces
 
-from sb3_hds.deploy.conversion import OPSET, Port
-from sb3_hds.deploy.observations import WHOLE, parts_of
+from sb3_hds.deploy.conversion import OPSET
+from sb3_hds.deploy.observations import SINGLE, Port, parts_of
 from sb3_hds.deploy.onnx_policy import METADATA, VERSION
 from sb3_hds.deploy.plan import Plan
 from sb3_hds.errors import ExportError, SB3HDSError
@@ -20,7 +21,6 @@ from sb3_hds.errors import ExportError, SB3HDSError
 _VERSIONS = ("sb3-hds", "jax", "flax", "torch", "stable-baselines3", "sbx-rl", "jax2onnx", "onnx")
 
 
-# --- what the file says of itself
 def metadata_of(
     plan: Plan,
     model: Any,
@@ -29,7 +29,7 @@ def metadata_of(
     ports: Mapping[str, Port],
     outputs: Sequence[str],
 ) -> dict[str, Any]:
-    channels, actuators = _named(plan, model, env)
+    channels, actuators = _channels_and_actuators(plan, model, env)
     return {
         "version": VERSION,
         "algorithm": type(model).__name__,
@@ -39,8 +39,8 @@ def metadata_of(
             if key in parts_of(plan.stack.observation_space)
         },
         "actions": actuators,
-        "dt": _interval(plan, model, env) if dt is None else float(dt),
-        "inputs": [_spelt(port) for port in ports.values()],
+        "dt": _dt(plan, model, env) if dt is None else float(dt),
+        "inputs": [_described(port) for port in ports.values()],
         "outputs": list(outputs),
         "memory": [
             {
@@ -60,7 +60,7 @@ def metadata_of(
     }
 
 
-def _spelt(port: Port) -> str:
+def _described(port: Port) -> str:
     shape = ", ".join(map(str, ("batch", *port.shape)))
     return f"{port.name} {port.dtype} ({shape})"
 
@@ -71,29 +71,27 @@ def _numbered(key: str, port: Port) -> list[dict[str, str]]:
     return [{"name": name, "unit": ""} for name in names]
 
 
-def _named(
+def _channels_and_actuators(
     plan: Plan, model: Any, env: gymnasium.Env | None
 ) -> tuple[dict[str, list[dict[str, str]]], list[dict[str, Any]]]:
-    """Channels and actuators, with the names and units of the twin where there is one that fits."""
+    """Channels and actuators, with names and units of the twin if there is one that fits."""
     space, twin = plan.stack.action_space, _twin(model, env)
     channels = {}
     if twin is not None and spaces.flatdim(plan.stack.observation_space) == len(twin.channels):
-        channels[WHOLE] = [{"name": c.name, "unit": c.unit} for c in twin.channels]
+        channels[SINGLE] = [{"name": c.name, "unit": c.unit} for c in twin.channels]
     match space:
         case spaces.Box():
             n = spaces.flatdim(space)
             names, units = [f"action[{i}]" for i in range(n)], [""] * n
             if twin is not None and len(twin.actuators) == n:
                 names, units = [a.name for a in twin.actuators], [a.unit for a in twin.actuators]
-            ends = zip(names, units, space.low.ravel(), space.high.ravel(), strict=True)
+            ends = (
+                [float(x) if math.isfinite(x) else None for x in end.ravel()]
+                for end in (space.low, space.high)
+            )
             return channels, [
-                {
-                    "name": name,
-                    "unit": unit,
-                    "low": _finite(float(low)),
-                    "high": _finite(float(high)),
-                }
-                for name, unit, low, high in ends
+                {"name": name, "unit": unit, "low": low, "high": high}
+                for name, unit, low, high in zip(names, units, *ends, strict=True)
             ]
         case spaces.Discrete():
             return channels, [{"name": "action", "n": int(space.n), "start": int(space.start)}]
@@ -101,10 +99,6 @@ def _named(
             counts = enumerate(space.nvec.ravel())
             return channels, [{"name": f"action[{i}]", "n": int(n), "start": 0} for i, n in counts]
     raise ExportError(f"Actions of this kind cannot be exported: {space}.")
-
-
-def _finite(limit: float) -> float | None:
-    return limit if math.isfinite(limit) else None
 
 
 def _twin(model: Any, env: gymnasium.Env | None) -> Any:
@@ -120,14 +114,14 @@ def _twin(model: Any, env: gymnasium.Env | None) -> Any:
         return None
 
 
-def _interval(plan: Plan, model: Any, env: gymnasium.Env | None) -> float | None:
+def _dt(plan: Plan, model: Any, env: gymnasium.Env | None) -> float | None:
     from sb3_hds.wrappers.interval import interval_of
 
     for layer in plan.stack.layers:
         if hasattr(layer.transform, "dt"):
             return float(layer.transform.dt)  # type: ignore[attr-defined]
     for holder in (plan.policy, model):
-        inner = getattr(holder, "body", None) or getattr(holder, "twin", None)
+        inner = getattr(holder, "robot", None) or getattr(holder, "twin", None)
         if getattr(inner, "dt", None):
             return float(inner.dt)  # type: ignore[union-attr]
     try:
@@ -137,7 +131,7 @@ def _interval(plan: Plan, model: Any, env: gymnasium.Env | None) -> float | None
 
 
 def _hash(policy: Any) -> str:
-    """Of all weights, in their order, by name."""
+    """Hash of all weights, ordered by name."""
     found = hashlib.sha256()
     for name, tensor in sorted(_tensors(policy).items()):
         found.update(name.encode())
@@ -158,23 +152,22 @@ def _versions() -> dict[str, str]:
 
     found = {}
     for name in _VERSIONS:
-        try:
+        # A checkout on the path has no version, nor does a library that is not installed.
+        with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:  # a checkout on the path, or a library that is not used
-            continue
     return found
 
 
 def prune(proto: Any) -> None:
-    """Remove constants that no operation reads: runtimes warn of them."""
+    """Remove constants that no operation reads, of which runtimes warn."""
     read = {name for node in proto.graph.node for name in node.input}
     kept = [part for part in proto.graph.initializer if part.name in read]
     del proto.graph.initializer[:]
     proto.graph.initializer.extend(kept)
 
 
-def write_metadata(proto: Any, told: Mapping[str, Any]) -> None:
+def write_metadata(proto: Any, metadata: Mapping[str, Any]) -> None:
     del proto.metadata_props[:]
     entry = proto.metadata_props.add()
-    entry.key, entry.value = METADATA, json.dumps(told)
+    entry.key, entry.value = METADATA, json.dumps(metadata)
     proto.producer_name = "sb3_hds"

@@ -1,4 +1,4 @@
-"""Observations of an exported policy: inputs by name, and ``VecNormalize`` as a part of it."""
+"""Observations of an exported policy: named inputs, and the normalisation of ``VecNormalize``."""
 
 import os
 from collections.abc import Mapping
@@ -9,24 +9,36 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 
-from sb3_hds.deploy.conversion import Port
 from sb3_hds.errors import ExportError
 
-# Where an entry of an observation has no limits, or wider ones: it is drawn from a Gaussian.
+# Entries of an observation with wider limits, or none, are drawn from a Gaussian.
 _WIDEST = 1e3
 OBSERVATION = "observation"
 
-#: name of an observation that is no dictionary
-WHOLE = ""
+#: key of an observation that is not a dictionary
+SINGLE = ""
+
+
+class Port(NamedTuple):
+    """
+    An input or an output.
+
+    :param shape: without the batch axis
+    :param dtype: NumPy's name
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
 
 
 class Normalization(NamedTuple):
     """
-    What ``VecNormalize`` does to one observation: ``clip((obs - mean) / scale)``.
+    Normalisation of one observation by ``VecNormalize``: ``clip((obs - mean) / scale)``.
 
     :param mean: of the shape of the observation
-    :param scale: likewise
-    :param clip: largest absolute value that comes out
+    :param scale: of the shape of the observation
+    :param clip: largest absolute value of the result
     """
 
     mean: np.ndarray
@@ -35,15 +47,15 @@ class Normalization(NamedTuple):
 
 
 def parts_of(space: spaces.Space) -> dict[str, spaces.Space]:
-    """:return: the parts of a dictionary; anything else under :data:`WHOLE`"""
-    return dict(space.spaces) if isinstance(space, spaces.Dict) else {WHOLE: space}
+    """:return: the parts of a dictionary; anything else under :data:`SINGLE`"""
+    return dict(space.spaces) if isinstance(space, spaces.Dict) else {SINGLE: space}
 
 
 def observation_ports(space: spaces.Space, double: bool) -> dict[str, Port]:
     """
-    :param double: whether numbers are in double precision
+    :param double: whether floats are in double precision
     :return: an input for each part of an observation
-    :raises ExportError: for a space that no policy here has
+    :raises ExportError: for an unsupported space
     """
     ports = {}
     for key, part in parts_of(space).items():
@@ -62,8 +74,8 @@ def observation_ports(space: spaces.Space, double: bool) -> dict[str, Port]:
 
 def flat(space: spaces.Space, observed: Mapping[str, jax.Array]) -> jax.Array:
     """
-    :param observed: by key, as in the space, with a leading axis
-    :return: as networks see them, shape ``(batch, obs)``: choices one-hot
+    :param observed: by key of the space, with a leading batch axis
+    :return: input of the networks, shape ``(batch, obs)``, with one-hot choices
     """
     rows = []
     for key, part in parts_of(space).items():
@@ -84,24 +96,24 @@ def _one_hot(choice: jax.Array, n: int, start: int) -> jax.Array:
 
 
 def normalized(values: Any, by: Normalization | None) -> Any:
-    """:return: as ``VecNormalize`` hands observations on, of NumPy or JAX"""
+    """:return: normalised like ``VecNormalize`` does, of NumPy or JAX"""
     if by is None:
         return values
     mean, scale = (np.asarray(part, values.dtype) for part in (by.mean, by.scale))
     return ((values - mean) / scale).clip(-by.clip, by.clip)
 
 
-def drawn(
+def random_observations(
     space: spaces.Space,
     n: int,
     scales: Mapping[str, tuple[np.ndarray, np.ndarray]],
     rng: np.random.Generator,
 ) -> dict[str, np.ndarray]:
     """
-    Observations to compare a file and its policy on.
+    Random observations to compare a file and its policy on.
 
-    :param scales: means and standard deviations of parts, where they are known
-    :return: by key, each with ``n`` rows, in single precision where they are numbers
+    :param scales: means and standard deviations of parts, if known
+    :return: by key, each with ``n`` rows, floats in single precision
     """
     found = {}
     for key, part in parts_of(space).items():
@@ -122,12 +134,14 @@ def drawn(
 def normalizations(normalize: Any) -> dict[str, Normalization]:
     """
     :param normalize: a ``VecNormalize``, or None
-    :return: by the key of each observation, :data:`WHOLE` where they are no dictionary; nothing
-        where observations are left alone
+    :return: by key of the observation, :data:`SINGLE` if it is not a dictionary; empty if
+        observations are not normalised
     """
     if normalize is None or not normalize.norm_obs:
         return {}
-    found = normalize.obs_rms if isinstance(normalize.obs_rms, dict) else {WHOLE: normalize.obs_rms}
+    found = (
+        normalize.obs_rms if isinstance(normalize.obs_rms, dict) else {SINGLE: normalize.obs_rms}
+    )
     return {
         name: Normalization(
             np.asarray(part.mean, np.float64),
@@ -140,10 +154,10 @@ def normalizations(normalize: Any) -> dict[str, Normalization]:
 
 def load_vec_normalize(path: str | os.PathLike[str]) -> Any:
     """
-    Unpickles: load what you have saved yourself.
+    Unpickles: only load files that you trust.
 
     :param path: ``vecnormalize.pkl`` of a training
-    :raises ExportError: for a file that holds something else
+    :raises ExportError: for a file with other content
     """
     import pickle
 
@@ -152,7 +166,7 @@ def load_vec_normalize(path: str | os.PathLike[str]) -> Any:
     with open(path, "rb") as file:
         try:
             found = pickle.load(file)
-        # Where pickle meets damage, it may raise anything.
+        # On damaged files, pickle may raise anything.
         except Exception as error:
             raise ExportError(f"'{path}' cannot be unpickled: {error}.") from error
     if not isinstance(found, VecNormalize):

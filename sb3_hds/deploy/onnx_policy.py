@@ -14,21 +14,27 @@ from sb3_hds.errors import ExportError
 METADATA = "sb3_hds.policy"
 VERSION = 1
 
+_DTYPES = {
+    "tensor(float)": np.float32,
+    "tensor(double)": np.float64,
+    "tensor(int64)": np.int64,
+    "tensor(int32)": np.int32,
+}
+
 State = tuple[np.ndarray, ...]
 
 
 class OnnxPolicy:
     """
-    Acts as the policy that was exported does with ``deterministic=True``; ``predict`` is SB3's, so
-    that ``evaluate_policy`` takes it for a model.
+    Acts like the exported policy with ``deterministic=True``. ``predict`` has the signature of SB3,
+    so that ``evaluate_policy`` accepts it as a model.
 
     Imports neither jax nor torch.
 
-    :param source: of :func:`~sb3_hds.deploy.export_onnx`: a path, or the content of the file
-    :param threads: of onnxruntime. One is the fastest for networks that control robots.
+    :param source: path or content of a file of :func:`~sb3_hds.deploy.export_onnx`
+    :param threads: of onnxruntime; one is fastest for small networks
     :raises FileNotFoundError: if there is no such file
-    :raises ExportError: for a file that something else wrote, a damaged one, or one of a newer
-        version
+    :raises ExportError: for a file without our metadata, a damaged one, or one of a newer version
     :raises ImportError: without onnxruntime
     """
 
@@ -48,44 +54,40 @@ class OnnxPolicy:
             self._session = onnxruntime.InferenceSession(
                 content, options, providers=["CPUExecutionProvider"]
             )
-        # Its errors have no base of their own.
+        # onnxruntime's errors have no common base class.
         except Exception as error:
             raise ExportError(f"{name} is no ONNX file that onnxruntime reads: {error}.") from error
         text = self._session.get_modelmeta().custom_metadata_map.get(METADATA)
-        #: what the file says of itself: names, units, bounds, versions
+        #: names, units, bounds and versions, as stored in the file
         self.metadata: Mapping[str, Any] = _metadata(text, name)
-        self._dtypes = {port.name: _dtype(port.type) for port in self._session.get_inputs()}
+        self._dtypes = {port.name: _DTYPES[port.type] for port in self._session.get_inputs()}
         self._shapes = {port.name: port.shape[1:] for port in self._session.get_inputs()}
         self._memory = self.metadata["memory"]
-        self._keys = {
-            name: name.partition(".")[2] for name in self._dtypes if name in self._observations()
-        }
+        observed = self.metadata["observations"]
+        self._keys = {name: name.partition(".")[2] for name in self._dtypes if name in observed}
         self._outputs = ["action", *(part["output"] for part in self._memory)]
         self._discrete = self.metadata["actions"][0].get("n") is not None
 
-    def _observations(self) -> Mapping[str, Any]:
-        return self.metadata["observations"]
-
     @property
     def dt(self) -> float | None:
-        """Control period of the policy [s]; None if it is not known."""
+        """Control interval of the policy [s]; None if it is not known."""
         return self.metadata["dt"]
 
     @property
     def observation_names(self) -> list[str]:
-        """Of the entries of an observation, in the order of the inputs."""
-        return [c["name"] for channels in self._observations().values() for c in channels]
+        """Names of the entries of an observation, in the order of the inputs."""
+        return [c["name"] for channels in self.metadata["observations"].values() for c in channels]
 
     @property
     def action_names(self) -> list[str]:
-        """Of the entries of an action."""
+        """Names of the entries of an action."""
         return [actuator["name"] for actuator in self.metadata["actions"]]
 
     @property
     def joints(self) -> tuple[list[int], list[int]] | None:
         """
-        Where ``qpos`` followed by ``qvel`` has the positions and the velocities that the policy
-        reads beside the observation; None where it reads none.
+        Indices, in ``qpos`` followed by ``qvel``, of the positions and velocities that the policy
+        reads in addition to the observation; None if it reads none.
         """
         found = self.metadata["joints"]
         return None if found is None else (found["position"], found["velocity"])
@@ -100,23 +102,23 @@ class OnnxPolicy:
         joints: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, State | None]:
         """
-        :param observation: one, or a batch; a dictionary where the policy saw one
-        :param state: what the last call returned; None: all episodes start now
+        :param observation: one, or a batch; a dictionary if the policy was trained with one
+        :param state: returned by the last call; None: all episodes start now
         :param episode_start: which episodes start now
-        :param deterministic: accepted for SB3's sake
-        :param joints: positions and velocities, where the policy reads them beside the observation
-        :return: action of the same number of rows, within its bounds; the state to pass next time,
-            None where the policy has none
-        :raises ValueError: for an observation of another shape, or that is not finite
+        :param deterministic: ignored, for compatibility with SB3
+        :param joints: positions and velocities, if the policy reads them
+        :return: actions within their bounds, one per observation; the state for the next call, None
+            if the policy has no memory
+        :raises ValueError: for an observation of another shape, or one that is not finite
         """
         rows, several = self._rows(observation, joints)
         n = len(next(iter(rows.values())))
         for i, part in enumerate(self._memory):
             initial = np.broadcast_to(np.asarray(part["initial"]), (n, len(part["initial"])))
-            held = initial if state is None else state[i]
+            memory = initial if state is None else state[i]
             if episode_start is not None:
-                held = np.where(np.reshape(episode_start, (-1, 1)), initial, held)
-            rows[part["input"]] = held.astype(self._dtypes[part["input"]])
+                memory = np.where(np.reshape(episode_start, (-1, 1)), initial, memory)
+            rows[part["input"]] = memory.astype(self._dtypes[part["input"]])
         action, *memory = map(np.asarray, self._session.run(self._outputs, rows))
         if self._discrete:
             action = action.astype(np.int64)
@@ -135,9 +137,9 @@ class OnnxPolicy:
             rows[name], several = self._batch(name, values)
         if (joints is None) != (self.joints is None):
             raise ValueError(
-                "The policy reads no joints beside the observation: leave out joints."
+                "The policy reads no joints: leave out joints."
                 if self.joints is None
-                else "The policy reads joints beside the observation: pass "
+                else "The policy reads joints in addition to the observation: pass "
                 "joints=(positions, velocities)."
             )
         if joints is not None:
@@ -150,12 +152,12 @@ class OnnxPolicy:
         several = values.ndim > len(shape)
         if values.shape[int(several) :] != shape or values.ndim > len(shape) + 1:
             raise ValueError(
-                f"{name} must have the shape {shape}, or that with a leading axis of a batch, got "
+                f"{name} must have the shape {shape}, or that with a leading batch axis, got "
                 f"{values.shape}."
             )
         if not np.isfinite(values).all():
             raise ValueError(
-                f"{name} is not finite: {values}. No action follows from it: repeat the last one, "
+                f"{name} is not finite: {values}. There is no action for it: repeat the last one, "
                 "or stop the robot safely."
             )
         return (values if several else values[None]).astype(self._dtypes[name]), several
@@ -177,12 +179,3 @@ def _metadata(text: str | None, name: str) -> dict[str, Any]:
             f"{name} is of version {version}, this sb3_hds reads up to {VERSION}. Upgrade sb3_hds."
         )
     return found
-
-
-def _dtype(kind: str) -> type:
-    return {
-        "tensor(float)": np.float32,
-        "tensor(double)": np.float64,
-        "tensor(int64)": np.int64,
-        "tensor(int32)": np.int32,
-    }[kind]

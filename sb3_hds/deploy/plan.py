@@ -12,10 +12,10 @@ from gymnasium import spaces
 
 from sb3_hds.core import Signals
 from sb3_hds.core.transforms.base import StatefulTransform
-from sb3_hds.deploy.conversion import Port
 from sb3_hds.deploy.observations import (
-    WHOLE,
+    SINGLE,
     Normalization,
+    Port,
     flat,
     normalized,
     observation_ports,
@@ -26,7 +26,7 @@ from sb3_hds.errors import ExportError
 from sb3_hds.wrappers import CPGPrior
 from sb3_hds.wrappers.action_layer import TransformLayer
 
-# They change neither what is observed nor what is commanded; RL Zoo patches Gymnasium's limit.
+# They change neither observations nor commands; PatchedTimeLimit is RL Zoo's.
 _NEUTRAL = {
     "Monitor",
     "OrderEnforcing",
@@ -42,12 +42,14 @@ _NEUTRAL = {
 
 class Layer(NamedTuple):
     """
+    A wrapper inside the file.
+
     :param name: of its memory in the file
-    :param transform: what it does
-    :param below: what lies below it
-    :param memory: at the start of an episode
+    :param transform: from its actions to commands
+    :param below: signals of the environment below it
+    :param memory: initial value in an episode
     :param action_space: of the environment below it
-    :param joints: that it reads from the machine, where it does
+    :param joints: that it reads from the robot; None: none
     """
 
     name: str
@@ -60,10 +62,12 @@ class Layer(NamedTuple):
 
 class Stack(NamedTuple):
     """
-    :param layers: from the policy inwards
-    :param observation_space: below the innermost of them
-    :param action_space: likewise
-    :param outside: wrappers further in, which the file does not contain
+    The wrappers between a policy and the environment.
+
+    :param layers: inside the file, the outermost first
+    :param observation_space: below the innermost layer
+    :param action_space: below the innermost layer
+    :param outside: wrappers further in, which are not in the file
     """
 
     layers: tuple[Layer, ...]
@@ -76,10 +80,10 @@ class Plan(NamedTuple):
     """
     What a file computes.
 
-    :param policy: of SB3's kind
-    :param function: what it computes; None for one of torch
-    :param stack: what lies between it and the environment
-    :param by: normalisation of the observations that it sees
+    :param policy: with the interface of SB3
+    :param function: what it computes; None for a torch policy
+    :param stack: wrappers between it and the environment
+    :param by: normalisation of its observations, by key
     """
 
     policy: Any
@@ -94,14 +98,15 @@ class Plan(NamedTuple):
 
     @property
     def joints(self) -> Joints | None:
-        """Those of the innermost that reads some."""
+        """Those of the innermost layer that reads some, or else of the policy."""
         layers = (layer.joints for layer in reversed(self.stack.layers) if layer.joints)
         return next(layers, self.function.joints if self.function else None)
 
 
-def fitting(stack: Stack, env: gymnasium.Env, policy: Any) -> Stack:
+def checked_stack(stack: Stack, env: gymnasium.Env, policy: Any) -> Stack:
     """
-    :raises ExportError: for an environment that the policy was not trained in
+    :return: the stack, with the spaces of the policy if it has no layers
+    :raises ExportError: for an environment with other spaces than the policy
     """
     seen, commanded = env.observation_space, env.action_space
     fits = spaces.flatdim(seen) == spaces.flatdim(policy.observation_space)
@@ -120,7 +125,8 @@ def fitting(stack: Stack, env: gymnasium.Env, policy: Any) -> Stack:
 
 def function_of(policy: Any) -> PolicyFunction | None:
     """
-    :raises ExportError: for a policy of another kind
+    :return: the function of a JAX policy; None for a torch policy
+    :raises ExportError: for a policy that cannot be exported
     """
     from stable_baselines3.common.policies import BasePolicy
 
@@ -133,7 +139,7 @@ def function_of(policy: Any) -> PolicyFunction | None:
         def of_one(obs: Any) -> Any:
             return policy._predict(obs[None], deterministic=True)[0]
 
-        # Distributions of TensorFlow Probability refuse a batch of unknown size.
+        # TensorFlow Probability does not support a batch of symbolic size.
         return PolicyFunction.without_memory(jax.vmap(of_one), squashed=policy.squash_output)
     if not isinstance(policy, BasePolicy):
         raise ExportError(
@@ -146,7 +152,7 @@ def function_of(policy: Any) -> PolicyFunction | None:
 
 
 def ports_of(plan: Plan) -> dict[str, Port]:
-    """Inputs, by the key of an observation, or by their own names."""
+    """Inputs by key of the observation; joints and memory by name."""
     double = bool(plan.memory)
     kind = "float64" if double else "float32"
     ports = observation_ports(plan.stack.observation_space, double)
@@ -160,7 +166,7 @@ def ports_of(plan: Plan) -> dict[str, Port]:
 
 
 def compute(plan: Plan, names: tuple[str, ...], *inputs: Any) -> tuple[Any, ...]:
-    """What the file computes, of arrays of JAX with a leading axis."""
+    """The function in the file, of JAX arrays with a leading batch axis."""
     assert plan.function is not None
     named = dict(zip(names, inputs, strict=True))
     observed = {key: named[key] for key in parts_of(plan.stack.observation_space)}
@@ -169,56 +175,54 @@ def compute(plan: Plan, names: tuple[str, ...], *inputs: Any) -> tuple[Any, ...]
         joints = named["joint_position"], named["joint_velocity"]
     memory = tuple(named[part.name] for part in plan.memory)
     n_own = len(plan.function.memory)
-    own, held = memory[:n_own], memory[n_own:]
+    own, memories = memory[:n_own], memory[n_own:]
     below: list[Any] = []
-    for layer, remembered in reversed(list(zip(plan.stack.layers, held, strict=True))):
-        below.insert(0, observed[WHOLE])
+    for layer, remembered in reversed(list(zip(plan.stack.layers, memories, strict=True))):
+        below.insert(0, observed[SINGLE])
         if layer.transform.observed:
-            observed = {WHOLE: jnp.concatenate([observed[WHOLE], remembered], -1)}
+            observed = {SINGLE: jnp.concatenate([observed[SINGLE], remembered], -1)}
     seen = {key: normalized(values, plan.by.get(key)) for key, values in observed.items()}
     action, own = plan.function.act(flat(plan.policy.observation_space, seen), joints, own)
     action = _in_units(action, plan.policy.action_space, plan.function.squashed)
     after = []
-    for layer, obs, remembered in zip(plan.stack.layers, below, held, strict=True):
-        act, read = jax.vmap(partial(command_of, layer)), joints if layer.joints else ()
-        action, remembered = act(action, obs, remembered, *read)
-        after.append(remembered)
+    for layer, obs, remembered in zip(plan.stack.layers, below, memories, strict=True):
+        act, read = jax.vmap(partial(apply_layer, layer)), joints if layer.joints else ()
+        action, next_memory = act(action, obs, remembered, *read)
+        after.append(next_memory)
     if isinstance(plan.stack.action_space, spaces.Box):
         action = action.astype(jnp.float32)
     return (action, *own, *after)
 
 
 def _in_units(action: Any, space: spaces.Space, squashed: bool) -> Any:
+    action = action.reshape(-1, *space.shape)  # type: ignore[misc]
     if not isinstance(space, spaces.Box):
-        return action.reshape(-1, *space.shape)  # type: ignore[misc]
+        return action
     low, high = space.low, space.high
-    action = action.reshape(-1, *space.shape)
     if squashed:
         action = low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
-    return jnp.clip(action, low, high) if _limited(space) else action
+    limited = np.isfinite(low).any() or np.isfinite(high).any()
+    return jnp.clip(action, low, high) if limited else action
 
 
-def _limited(space: spaces.Box) -> bool:
-    return bool(np.isfinite(space.low).any() or np.isfinite(space.high).any())
-
-
-def command_of(layer: Layer, action: Any, obs: Any, memory: Any, *joints: Any) -> tuple[Any, Any]:
-    """What a layer makes of one action, of JAX or of NumPy."""
-    rhythm: Any = layer.transform
+def apply_layer(layer: Layer, action: Any, obs: Any, memory: Any, *joints: Any) -> tuple[Any, Any]:
+    """Command and next memory of a layer for one action, of JAX or NumPy."""
+    transform: Any = layer.transform
     if layer.joints is None:
-        return rhythm.act(action, obs, memory, layer.below)
-    chosen = action.clip(-1.0, 1.0)
-    target, after = rhythm.target(chosen, memory)
-    command = rhythm.command(chosen, target, *joints)
-    return command.clip(*layer.below.limits()), after
+        return transform.act(action, obs, memory, layer.below)
+    action = action.clip(-1.0, 1.0)
+    target, next_memory = transform.target(action, memory)
+    command = transform.command(action, target, *joints)
+    return command.clip(*layer.below.limits()), next_memory
 
 
 def stack_of(env: gymnasium.Env, inside: bool) -> Stack:
     """
-    Layers from the outside in, as far as they are :class:`~sb3_hds.core.StatefulTransform`.
+    The outer wrappers with a :class:`~sb3_hds.core.StatefulTransform` as layers, the others by
+    name.
 
-    :param inside: whether they go into the file
-    :raises ExportError: for a layer that begins each episode with what is observed there
+    :param inside: whether layers go into the file
+    :raises ExportError: for a layer whose initial memory depends on the observation
     """
     layers: list[Layer] = []
     while isinstance(env, gymnasium.Wrapper):
@@ -241,9 +245,9 @@ def _layer(env: TransformLayer, place: int) -> Layer:
     memory = transform.start(np.zeros(n), below)
     if transform.persists or not np.array_equal(memory, transform.start(np.ones(n), below)):
         raise ExportError(
-            f"{type(env).__name__} begins an episode with what was observed or commanded before, "
-            "and a file begins with constants. Export without wrappers, layers=False, and wrap the "
-            "environment where the policy runs."
+            f"{type(env).__name__} initialises its memory from observations or earlier commands, "
+            "but the memory of a file starts from constants. Export without wrappers, "
+            "layers=False, and wrap the environment where the policy runs."
         )
     name = transform.name if place == 0 else f"{transform.name}_{place}"
     return Layer(name, transform, below, np.asarray(memory), env.commands, _joints(env))

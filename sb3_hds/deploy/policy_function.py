@@ -1,4 +1,4 @@
-"""What a policy computes where nothing is explored, as a pure function of its memory, too."""
+"""The deterministic policy as a pure function of observations and memory."""
 
 import dataclasses
 from collections.abc import Callable
@@ -10,10 +10,10 @@ from jaxtyping import Array, Float
 
 class Memory(NamedTuple):
     """
-    What a policy carries from one step to the next.
+    State that a policy carries from one step to the next.
 
-    :param name: of the input; that of the output is ``next_<name>``
-    :param initial: at the start of an episode, shape ``(n,)``
+    :param name: of the input; the output is ``next_<name>``
+    :param initial: value at the start of an episode, shape ``(n,)``
     """
 
     name: str
@@ -22,10 +22,10 @@ class Memory(NamedTuple):
 
 class Joints(NamedTuple):
     """
-    Joints that a policy reads from the machine, beside the observation.
+    Joints that a policy reads from the robot in addition to the observation.
 
-    :param position: of each, its entry in ``qpos`` followed by ``qvel``
-    :param velocity: likewise
+    :param position: index of each position in ``qpos`` followed by ``qvel``
+    :param velocity: index of each velocity there
     """
 
     position: tuple[int, ...]
@@ -45,16 +45,16 @@ Act = Callable[
 @dataclasses.dataclass(frozen=True)
 class PolicyFunction:
     """
-    A policy's method ``policy_function`` returns one; exporting asks nothing else of it.
+    What ``policy_function``, a method of policies, returns for an export.
 
-    :param act: observations, flat, choices one-hot; positions and velocities of the joints where
-        ``joints`` names some, otherwise nothing; the memory. To actions, and the memory after them
-    :param squashed: whether actions are within [-1, 1] and stand for the range of the action space;
+    :param act: from flat observations with one-hot choices, positions and velocities of the joints
+        (an empty tuple without ``joints``) and the memory, to actions and the next memory
+    :param squashed: whether actions are in [-1, 1] and scaled to the range of the action space;
         otherwise they are in its units, and are clipped to it
     :param memory: one entry for each array of the memory
-    :param joints: that the policy reads beside the observation
-    :param scales: mean and standard deviation of the flat observations that it met, where it knows
-        them: a file is compared on observations of that size
+    :param joints: read in addition to the observation; None: none
+    :param scales: mean and standard deviation of the flat observations in training, if known: the
+        file is checked on observations of that scale
     """
 
     act: Act
@@ -72,6 +72,6 @@ class PolicyFunction:
     ) -> Self:
         """
         :param act: flat observations, shape ``(batch, obs)``, to actions, shape ``(batch, act)``
-        :param scales: see above
+        :param scales: as above
         """
         return cls(lambda obs, joints, memory: (act(obs), memory), squashed, scales=scales)

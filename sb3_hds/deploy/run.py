@@ -1,4 +1,4 @@
-"""A policy file in an environment, at its rate, with what it did recorded."""
+"""Run a policy file in an environment in real time, and record it."""
 
 import os
 import time
@@ -12,23 +12,23 @@ from gymnasium import spaces
 
 from sb3_hds.deploy.onnx_policy import OnnxPolicy
 from sb3_hds.errors import ExportError
-from sb3_hds.wrappers.hardware.real_time import RealTime, Timing
-from sb3_hds.wrappers.hardware.record import Record
+from sb3_hds.wrappers.real_time import RealTime, Timing
+from sb3_hds.wrappers.record import Record
 
-# Columns of the bars of a histogram.
+# Width of the bars of the histogram.
 _WIDTH = 40
 
 
 class Latencies(NamedTuple):
     """
-    What a run took, and earned.
+    Latencies and returns of a run.
 
-    :param period: of a step [s]
-    :param inference: of the policy alone, one for each step [s]
+    :param period: control interval [s]
+    :param inference: time of the policy alone, one per step [s]
     :param counts: histogram of the times from observation to command, without the first of each
         episode
-    :param edges: of its bins [s], one more; the last one is infinite
-    :param timing: how many steps were late
+    :param edges: of its bins [s], one more than counts; the last is infinite
+    :param timing: counts of late steps
     :param returns: of the episodes
     """
 
@@ -72,23 +72,23 @@ def run_policy(
     sleep: Callable[[float], None] = time.sleep,
 ) -> Latencies:
     """
-    Act in real time, by :class:`~sb3_hds.wrappers.RealTime`.
+    Run a policy in real time, by :class:`~sb3_hds.wrappers.RealTime`.
 
     Imports neither jax nor torch, unless the environment does.
 
-    :param policy: what acts
-    :param env: a simulation or a robot; it is closed in the end
+    :param policy: to run
+    :param env: a simulation or a robot; closed at the end
     :param rate: steps per second [Hz]; default: that of the policy
-    :param n_episodes: after which it ends
-    :param max_steps: after which it ends in any case
+    :param n_episodes: to run
+    :param max_steps: in total; None: no limit
     :param record: file of :class:`~sb3_hds.data.Recorder` to write; None: nothing is recorded
-    :param condition: label of what is recorded
+    :param condition: label of the recording
     :param seed: of the first reset
-    :param safe_action: of the watchdog; None: there is none
+    :param safe_action: of the watchdog; None: no watchdog
     :param clock: monotonic [s]
-    :param sleep: waits for so many seconds
-    :return: how long it took
-    :raises ExportError: for an environment that the policy does not fit, or an unknown rate
+    :param sleep: waits for a time [s]
+    :return: latencies and returns
+    :raises ExportError: for an environment that does not fit the policy, or an unknown rate
     :raises TrajectoryError: if the recording cannot be written
     """
     _check_fits(policy, env)
@@ -129,7 +129,7 @@ def _period(policy: OnnxPolicy, rate: float | None) -> float:
         return 1.0 / rate
     if policy.dt is None:
         raise ExportError(
-            "The file does not say how long a step of its policy is. Pass the rate, in Hz: "
+            "The file does not contain the control interval of its policy. Pass the rate [Hz]: "
             "run_policy(..., rate=50), or --rate 50."
         )
     return policy.dt
@@ -145,7 +145,7 @@ def _check_fits(policy: OnnxPolicy, env: gymnasium.Env) -> None:
         outside = policy.metadata["outside"]
         hint = f" Wrap it as in the training: {', '.join(outside)}." if outside else ""
         raise ExportError(
-            f"The policy takes {wanted} observed numbers and gives {len(policy.action_names)} "
+            f"The policy takes {wanted} observed numbers and returns {len(policy.action_names)} "
             f"commands; the environment has {found} and {actions}.{hint}"
         )
 
@@ -157,9 +157,9 @@ def _joints(policy: OnnxPolicy, env: gymnasium.Env) -> tuple[np.ndarray, np.ndar
     inner: Any = env.unwrapped
     if not hasattr(inner, "state_vector"):
         raise ExportError(
-            "The policy reads joints beside the observation, by state_vector() of Gymnasium's "
-            "MuJoCo environments, and this environment has no such method. Call "
-            "OnnxPolicy.predict(obs, state, joints=(positions, velocities)) in a loop of your own."
+            "The policy reads joints in addition to the observation, by state_vector() of "
+            "Gymnasium's MuJoCo environments, which this one does not have. Call "
+            "OnnxPolicy.predict(obs, state, joints=(positions, velocities)) in your own loop."
         )
     state = np.asarray(inner.state_vector())
     position, velocity = places
@@ -167,7 +167,7 @@ def _joints(policy: OnnxPolicy, env: gymnasium.Env) -> tuple[np.ndarray, np.ndar
 
 
 def _unique(names: Sequence[str]) -> list[str]:
-    """Channels of a recording need names of their own, and those of a Dict need not have them."""
+    """Make names unique, as a recording needs them; those of a Dict may repeat."""
     seen: Counter[str] = Counter()
     found = []
     for name in names:

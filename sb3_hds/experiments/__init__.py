@@ -1,5 +1,5 @@
 """
-Measured effects of a change: several seeds, paired start states, confidence intervals.
+Experiments over several seeds, with paired initial states and confidence intervals.
 
 Names are imported on first use.
 """

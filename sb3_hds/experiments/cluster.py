@@ -1,4 +1,4 @@
-"""Work on the machines of a Ray cluster."""
+"""Run tasks on the machines of a Ray cluster."""
 
 import logging
 import os
@@ -8,22 +8,22 @@ from typing import Any, NamedTuple, TypeVar
 
 from sb3_hds.errors import StudyError
 
-Given = TypeVar("Given")
-Told = TypeVar("Told")
+Input = TypeVar("Input")
+Result = TypeVar("Result")
 
-# How long a cluster may take to answer [s]: Ray itself asks for minutes.
-_ANSWERS = 10.0
-# Tasks that Ray is given at a time: enough for it to see what is needed, few enough that asking
-# which of them have ended costs nothing.
+# Time limit of the connection to a cluster [s]; Ray itself retries for minutes.
+_TIMEOUT = 10.0
+# Tasks submitted to Ray at a time: enough for it to see the demand, few enough that polling them is
+# cheap.
 _IN_FLIGHT = 256
 
 
 class Share(NamedTuple):
     """
-    What a task takes of a node.
+    Resources of a task on its node.
 
-    :param cpus: cores
-    :param gpus: may be a fraction: several tasks then share one
+    :param cpus: number of cores
+    :param gpus: number of GPUs; with a fraction, tasks share one
     :param memory: [GiB]
     """
 
@@ -33,41 +33,42 @@ class Share(NamedTuple):
 
 
 def on_cluster(
-    work: Callable[[Given], Told],
-    given: Sequence[Given],
+    work: Callable[[Input], Result],
+    given: Sequence[Input],
     address: str = "auto",
     share: Share | None = None,
     most: int | None = None,
-) -> Iterator[tuple[Given, Told]]:
+) -> Iterator[tuple[Input, Result]]:
     """
-    Each is a task of its own. Those of a node that dies are begun anew on another one.
+    Run a function on each input, as tasks of a cluster. Tasks of a node that dies are restarted on
+    another one.
 
-    :param work: what a task does; nodes need the same versions of what it imports
-    :param given: what each is done with
-    :param address: of the cluster; ``"auto"``: the one that this machine is part of
-    :param share: of a node that a task takes; default: that of ``Share()``
-    :param most: tasks at a time; default: as many as the cluster has room for
-    :return: what was given and what came of it, as tasks end
-    :raises StudyError: where there is no Ray, no such cluster, or no node with such a share
+    :param work: the function; nodes need the same versions of what it imports
+    :param given: the inputs
+    :param address: of the cluster; ``"auto"``: the one that this machine belongs to
+    :param share: resources of a task; default: ``Share()``
+    :param most: tasks at a time; default: as many as the cluster has resources for
+    :return: inputs and results, as tasks end
+    :raises StudyError: without Ray, for an unknown cluster, or if no node has the resources
     """
     try:
         import ray
     except ImportError as error:
-        raise StudyError("There is no Ray here: pip install 'sb3_hds[cluster]'.") from error
+        raise StudyError("Ray is not installed: pip install 'sb3_hds[cluster]'.") from error
     share, begun = share or Share(), not ray.is_initialized()
     if begun:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
-            _check_answers(address)
+            _check_reachable(address)
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
         except (OSError, ValueError, RuntimeError) as error:
             raise StudyError(
                 f"There is no Ray cluster at '{address}' ({error}). Start one: ray start --head."
             ) from error
     try:
-        _check_room(ray.nodes(), share)
+        _check_resources(ray.nodes(), share)
 
-        def done(one: Given) -> Told:
+        def done(one: Input) -> Result:
             return work(one)
 
         task: Any = ray.remote(done).options(
@@ -89,13 +90,13 @@ def on_cluster(
             ray.shutdown()
 
 
-def _check_answers(address: str) -> None:
+def _check_reachable(address: str) -> None:
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if colon and port.isdigit():
-        socket.create_connection((host, int(port)), _ANSWERS).close()
+        socket.create_connection((host, int(port)), _TIMEOUT).close()
 
 
-def _check_room(nodes: Sequence[dict[str, Any]], share: Share) -> None:
+def _check_resources(nodes: Sequence[dict[str, Any]], share: Share) -> None:
     wanted = {"CPU": share.cpus, "GPU": share.gpus, "memory": share.memory * 2**30}
     alive = [node["Resources"] for node in nodes if node["Alive"]]
     if any(all(has.get(what, 0.0) >= size for what, size in wanted.items()) for has in alive):
@@ -107,5 +108,5 @@ def _check_room(nodes: Sequence[dict[str, Any]], share: Share) -> None:
     raise StudyError(
         f"No node has {share.cpus:g} cores, {share.gpus:g} GPUs and {share.memory:g} GiB to give: "
         f"the largest have {largest['CPU']:g} cores, {largest['GPU']:g} GPUs and "
-        f"{largest['memory'] / 2**30:.1f} GiB. Ask for less, or for a cluster with more."
+        f"{largest['memory'] / 2**30:.1f} GiB. Request less, or use a larger cluster."
     )

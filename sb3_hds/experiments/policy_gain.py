@@ -1,4 +1,4 @@
-"""The policy gain of a diagnosis: the return on the real system."""
+"""The policy gain of a diagnosis: return on the real system after training in each twin."""
 
 import dataclasses
 import inspect
@@ -27,7 +27,7 @@ from sb3_hds.experiments.returns import returns_of
 from sb3_hds.sysid import Diagnosis
 from sb3_hds.sysid.reporting.figures import as_png, plot_policy_gain
 from sb3_hds.sysid.reporting.wording import policy_in_words
-from sb3_hds.wrappers.episodes.step_limit import step_limit_of
+from sb3_hds.wrappers.episodes import step_limit_of
 
 _N_RESAMPLES = 2000
 _LEVEL = 0.9
@@ -38,7 +38,7 @@ class Return:
     """
     :param mean: interquartile mean over runs and episodes
     :param low: lower end of its 90 % interval, by bootstrap over runs; None for a single run
-    :param high: upper end
+    :param high: upper end of the interval
     """
 
     mean: float
@@ -51,9 +51,10 @@ class PolicyGain:
     """
     Return on the real system of policies that were trained in simulations. Prints itself.
 
-    :param returns: by simulation (``"believed"``, ``"extended"``, and ``"true"`` where there is
-        one): one row for each run, one column for each start state, shape ``(runs, episodes)``
-    :param gain: of the extended over the nominal twin, paired by run and start state
+    :param returns: by simulation (``"believed"`` for the nominal twin, ``"extended"``, and
+        ``"true"`` if known): one row per run, one column per initial state, shape
+        ``(runs, episodes)``
+    :param gain: of the extended over the nominal twin, paired by run and initial state
     """
 
     returns: Mapping[str, Float[np.ndarray, "runs episodes"]]
@@ -66,8 +67,8 @@ class PolicyGain:
     @property
     def share_of_ceiling(self) -> float | None:
         """
-        Share of the gap to policies from the true twin that was closed; None without such a twin,
-        or without a gap.
+        Share of the gap to policies from the true twin that was closed; None if that twin is
+        unknown, or there is no gap.
         """
         if "true" not in self.returns:
             return None
@@ -87,8 +88,8 @@ class PolicyGain:
 
     def plot(self, path: str | os.PathLike[str]) -> Path:
         """
-        Draw the returns: one dot for each run (of a single run, for each start state), lines at
-        the interquartile means, and bars over their intervals.
+        Plot the returns: one dot per run (with a single run, per initial state), lines at the
+        interquartile means, and bars for their intervals.
 
         :param path: of the picture
         :raises ImportError: without matplotlib (extra ``report``)
@@ -120,28 +121,28 @@ def measure_policy_gain(
     **arguments: Any,
 ) -> PolicyGain:
     """
-    Train with the same budget in the nominal and in the extended twin, and act on the real system.
+    Train with the same budget in the nominal and in the extended twin, and measure returns on the
+    real system.
 
-    Runs with the same seed differ in the twin only, and all act from the same start states. Where
-    ``env`` is one of our stand-ins for hardware, or made of a twin, policies from its true twin are
-    the ceiling.
+    Runs with the same seed differ in the twin only, and all start from the same initial states. If
+    ``env`` is one of our stand-ins for hardware, or a :class:`~sb3_hds.envs.TwinEnv`, policies from
+    its true twin are the ceiling.
 
     :param diagnosis: whose ``believed`` and extended ``twin`` are compared
-    :param env: the real system, its id, or a function that makes it; without a step limit it gets
-        that of the nominal twin
+    :param env: the real system, its id, or a function that makes it; without a step limit, that of
+        the nominal twin is applied
     :param algorithm: trained in the simulations only
-    :param budget: steps of the simulated environment; 0 is enough for PODS and HDS, which plan in
-        their twin before they act
-    :param seeds: runs in each simulation
-    :param n_episodes: start states on the real system
-    :param ceiling: whether policies are also trained in the true twin, where there is one; or that
-        twin
+    :param budget: training steps per policy; 0 suffices for PODS and HDS, which plan in their twin
+        before the first step
+    :param seeds: runs per simulation
+    :param n_episodes: number of initial states on the real system
+    :param ceiling: whether to train in the true twin, too, if it is known; or that twin
     :param progress: whether to show a progress bar
     :param arguments: of the algorithm
     :return: returns by simulation, and the gain with its interval
-    :raises TrajectoryError: for a twin without task, fewer than one run or episode, or an algorithm
-        that learns nothing in so few steps
-    :raises ParameterError: for an argument that the algorithm does not have
+    :raises TrajectoryError: for a twin without a task, fewer than one run or episode, or an
+        algorithm that learns nothing within the budget
+    :raises ParameterError: for an unknown argument of the algorithm
     :raises EnvironmentMismatchError: if the real system has other observations or actions
     """
     made = _made(env)
@@ -174,7 +175,7 @@ def check_question(
     arguments: Mapping[str, Any],
 ) -> None:
     """
-    The checks of :func:`measure_policy_gain`, which need no diagnosis.
+    The checks of :func:`measure_policy_gain` that need no diagnosis.
 
     :param nominal: the nominal twin
     :param arguments: of the algorithm
@@ -200,7 +201,7 @@ def check_question(
         )
     if nominal.max_episode_steps is None:
         raise TrajectoryError(
-            f"{nominal.name} has no episode length, so no task to be good at. "
+            f"{nominal.name} has no episode length, so there is no task to train for. "
             "Give its class max_episode_steps and a reward."
         )
     _check_same_signals(real, nominal)
@@ -224,8 +225,8 @@ def _check_same_signals(real: gymnasium.Env, nominal: Twin) -> None:
     if ours != theirs:
         raise EnvironmentMismatchError(
             f"The real system has observations of shape {theirs}, {nominal.name} of shape {ours}. "
-            "A policy from the one cannot act on the other: wrap the system, so that it reports "
-            "what the twin does."
+            "A policy of one cannot act on the other: wrap the system so that its observations "
+            "are those of the twin."
         )
     ours, theirs = simulated.action_space, real.action_space
     if not (
@@ -236,7 +237,7 @@ def _check_same_signals(real: gymnasium.Env, nominal: Twin) -> None:
         shown = "no Box" if not isinstance(theirs, gymnasium.spaces.Box) else _range(theirs)
         raise EnvironmentMismatchError(
             f"The real system takes actions in {shown}, {nominal.name} in {_range(ours)}. Wrap "
-            "the system, so that the same number means the same."
+            "the system so that actions mean the same."
         )
 
 
@@ -246,7 +247,7 @@ def _range(space: gymnasium.spaces.Box) -> str:
 
 
 def _true_twin(real: gymnasium.Env, ceiling: bool | Twin) -> Twin | None:
-    """The twin of the real system; None if it is unknown or no ceiling is asked for."""
+    """The twin of the real system; None if it is unknown or no ceiling is wanted."""
     if isinstance(ceiling, Twin):
         return ceiling
     if not ceiling:
@@ -265,7 +266,7 @@ def _task(twin: Twin) -> gymnasium.Env:
 
 
 def _summarised(values: Float[np.ndarray, "runs episodes"]) -> Return:
-    """Interquartile mean, and what resampling the runs makes of it, if there are several."""
+    """Interquartile mean, with its bootstrap interval over runs if there are several."""
     n = len(values)
     if n == 1:
         return Return(float(_interquartile_means(values[None])[0]), None, None)

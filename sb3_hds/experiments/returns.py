@@ -1,11 +1,11 @@
-"""Return of a policy from start states that others can be measured from as well."""
+"""Returns of a policy from initial states that are the same for all policies."""
 
 import gymnasium
 import numpy as np
 from jaxtyping import Float
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-#: seed of the first start state, which no training uses
+#: seed of the first initial state, outside the seeds of trainings
 FIRST_START = 70_000
 
 
@@ -13,13 +13,13 @@ def returns_of(
     model: BaseAlgorithm, env: gymnasium.Env, n_episodes: int = 50
 ) -> Float[np.ndarray, " episodes"]:
     """
-    Run whole episodes of the deterministic policy. Start states depend on the environment only, so
+    Run full episodes of the deterministic policy. Initial states depend on the environment only, so
     that policies can be compared in pairs.
 
-    :param model: a policy
-    :param env: not vectorised, left as it is after the last episode
-    :param n_episodes: how many
-    :return: undiscounted
+    :param model: with the policy to run
+    :param env: not vectorised; not closed
+    :param n_episodes: number of episodes
+    :return: undiscounted returns
     """
     totals = np.zeros(n_episodes)
     for episode in range(n_episodes):

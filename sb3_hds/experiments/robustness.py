@@ -1,4 +1,4 @@
-"""What is left of a return when sensors are noisy or fail, or something pushes."""
+"""Returns of a policy under sensor noise, sensor failures and pushes."""
 
 import dataclasses
 import functools
@@ -18,9 +18,9 @@ from sb3_hds.algos import OpenLoop
 from sb3_hds.errors import EnvironmentMismatchError, TrajectoryError
 from sb3_hds.experiments.returns import FIRST_START
 from sb3_hds.wrappers import Perturb
-from sb3_hds.wrappers.episodes.step_limit import step_limit_of
+from sb3_hds.wrappers.episodes import step_limit_of
 
-#: arguments of :class:`~sb3_hds.wrappers.Perturb` by the name that a table shows
+#: arguments of :class:`~sb3_hds.wrappers.Perturb`, by name in the table
 PERTURBATIONS: dict[str, dict[str, Any]] = {
     "none": {},
     "noise 0.25": {"noise": 0.25},
@@ -36,20 +36,22 @@ class Robustness:
     """
     Returns of one policy under perturbations. Prints itself.
 
-    :param returns: by perturbation, one for each episode; all start alike
-    :param left_out: perturbations that the environment does not have, and why
+    :param returns: by perturbation, one per episode; initial states are the same for all
+    :param left_out: perturbations that the environment does not support, and why
     """
 
     returns: Mapping[str, Float[np.ndarray, " episodes"]]
     left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def share(self, perturbation: str) -> float | None:
-        """:return: mean return as a share of the unperturbed one; None unless that is positive"""
-        whole = float(np.mean(self.returns["none"]))
-        return float(np.mean(self.returns[perturbation])) / whole if whole > 0.0 else None
+        """:return: mean return relative to the unperturbed one; None unless that is positive"""
+        unperturbed = float(np.mean(self.returns["none"]))
+        return (
+            float(np.mean(self.returns[perturbation])) / unperturbed if unperturbed > 0.0 else None
+        )
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """:return: plain data, one row for each perturbation; None where a number means nothing"""
+        """:return: plain data, one row per perturbation; None for undefined numbers"""
         return [
             {
                 "perturbation": name,
@@ -63,7 +65,7 @@ class Robustness:
 
     def __str__(self) -> str:
         n, rows = len(self.returns["none"]), self.to_rows()
-        over = f"over {n} episodes from the same starts" if n > 1 else "of one episode each"
+        over = f"over {n} episodes from the same initial states" if n > 1 else "of one episode each"
         widths = {"return": 10, "std": 9, "worst": 10, "share": 8}
         if n == 1:
             del widths["std"], widths["worst"]
@@ -76,7 +78,7 @@ class Robustness:
             lines.append(f"  {row['perturbation']:<16}{cells}")
         notes = [f"{name} is left out: {why}" for name, why in self.left_out.items()]
         if "share" not in widths:
-            notes.append("Unperturbed, the return is not positive, so there are no shares of it.")
+            notes.append("The unperturbed return is not positive, so there are no shares of it.")
         for note in notes:
             lines += textwrap.wrap(note, 78, initial_indent="  ", subsequent_indent="  ")
         return "\n".join(lines)
@@ -102,30 +104,28 @@ def measure_robustness(
     progress: bool = True,
 ) -> Robustness:
     """
-    Run the deterministic policy under each perturbation, from the same starts.
+    Run the deterministic policy under each perturbation, from the same initial states.
 
-    Noise and failures are in what the policy observes. The motors of an open-loop gait have
-    encoders of their own, as on a robot, so that neither reaches them; ``encoders="observation"``
-    lets the loop that tracks joints see what the policy sees. A push reaches everybody.
-    Perturbations that the environment does not have, such as a push without MuJoCo, are left out
-    and named.
+    Noise and failures affect observations. The motors of an open-loop gait have their own encoders,
+    as on a robot, which are not affected; with ``encoders="observation"``, the controller that
+    tracks joints uses the perturbed observations. Pushes affect all policies. Perturbations that
+    the environment does not support, such as a push without MuJoCo, are left out and reported.
 
-    Source: after Raffin et al., *An Open-Loop Baseline*, RLJ 2024, table 2; how it defined units,
-    sensors and pushes is not published, see :class:`~sb3_hds.wrappers.Perturb` for what is done
-    here.
+    Source: after Raffin et al., *An Open-Loop Baseline*, RLJ 2024, table 2; it does not define
+    units, sensors and pushes, see :class:`~sb3_hds.wrappers.Perturb` for the definitions here.
 
     :param model: any saved model of Stable-Baselines3, SBX or this package
-    :param env: its id, or a function that makes it
-    :param wrapper: puts the wrappers that the model was trained with around it; what they see is
-        perturbed already, as behind the sensors of a robot
-    :param perturbations: arguments of ``Perturb`` by name, ``"none"`` among them
-    :param n_episodes: of each
+    :param env: id of the environment, or a function that makes it
+    :param wrapper: applies the wrappers of the training; they see perturbed observations, as behind
+        the sensors of a robot
+    :param perturbations: arguments of ``Perturb`` by name, including ``"none"``
+    :param n_episodes: per perturbation
     :param encoders: ``"own"`` or ``"observation"``
-    :param normalize: file of the statistics of ``VecNormalize`` that the model was trained with
-    :param progress: whether a bar shows how far it is
+    :param normalize: file of the ``VecNormalize`` of the training
+    :param progress: whether to show a progress bar
     :raises TrajectoryError: for fewer than one episode, or without the perturbation ``"none"``
-    :raises EnvironmentMismatchError: where observations cannot be perturbed at all, or are not what
-        the model observes, or where nothing says after how many steps an episode ends
+    :raises EnvironmentMismatchError: if observations cannot be perturbed, do not fit the model, or
+        episodes have no step limit
     """
     if n_episodes < 1 or "none" not in perturbations or encoders not in ("own", "observation"):
         raise TrajectoryError(
@@ -135,9 +135,9 @@ def measure_robustness(
         )
     make = functools.partial(_perturbed, env, wrapper or (lambda inner: inner))
     _check_fits(model, make(perturbations["none"]))
-    returns, left_out = {}, _impossible(make, perturbations)
-    possible = {name: how for name, how in perturbations.items() if name not in left_out}
-    shown = track(possible.items(), "perturbing", transient=True, disable=not progress)
+    returns, left_out = {}, _unsupported(make, perturbations)
+    supported = {name: how for name, how in perturbations.items() if name not in left_out}
+    shown = track(supported.items(), "perturbing", transient=True, disable=not progress)
     for name, settings in shown:
         venv: VecEnv = DummyVecEnv([functools.partial(make, settings)])
         try:
@@ -164,23 +164,23 @@ def _check_fits(model: BaseAlgorithm, env: gymnasium.Env) -> None:
     env.close()
     if limit is None:
         raise EnvironmentMismatchError(
-            f"Nothing says after how many steps an episode of {env} ends, so the first one might "
-            "never: put gymnasium.wrappers.TimeLimit around it, or make it with max_episode_steps."
+            f"{env} has no step limit, so that an episode might never end: wrap it in "
+            "gymnasium.wrappers.TimeLimit, or make it with max_episode_steps."
         )
     ours = model.observation_space, model.action_space
     for mine, given in zip(ours, (env.observation_space, env.action_space), strict=True):
         if type(mine) is not type(given) or mine.shape != given.shape:
             raise EnvironmentMismatchError(
                 f"The model was trained with {mine}, and the environment has {given}. Make it with "
-                "the same arguments, and put the wrappers around it that were there in training."
+                "the same arguments and wrappers as in the training."
             )
 
 
-def _impossible(
+def _unsupported(
     make: Callable[[Mapping[str, Any]], gymnasium.Env],
     perturbations: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, str]:
-    """:return: why the environment does not have these perturbations, before any episode is run"""
+    """:return: the unsupported perturbations, and why, before any episode is run"""
     reasons = {}
     for name, settings in perturbations.items():
         try:
@@ -195,16 +195,15 @@ def _impossible(
 def _returns(
     model: BaseAlgorithm, env: VecEnv, n_episodes: int, encoders: str
 ) -> Float[np.ndarray, " episodes"]:
-    tracks = isinstance(model, OpenLoop) and (model.robot or {}).get("control") == "track"
-    own = tracks and encoders == "own"
-    before = model.policy.read_states if isinstance(model, OpenLoop) else None
-    try:
-        if own and isinstance(model, OpenLoop):
-            model.read_joints_from(env)
+    gait = model if isinstance(model, OpenLoop) and encoders == "own" else None
+    if gait is None or (gait.robot or {}).get("control") != "track":
         return np.array([_episode(model, env, FIRST_START + i) for i in range(n_episodes)])
+    before = gait.policy.read_states
+    gait.read_joints_from(env)
+    try:
+        return _returns(model, env, n_episodes, "observation")
     finally:
-        if own and isinstance(model, OpenLoop):
-            model.policy.read_states = before
+        gait.policy.read_states = before
 
 
 def _episode(model: BaseAlgorithm, env: VecEnv, seed: int) -> float:

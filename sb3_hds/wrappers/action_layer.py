@@ -2,7 +2,6 @@
 
 import abc
 import inspect
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import gymnasium
@@ -12,6 +11,7 @@ from gymnasium import spaces
 from sb3_hds.core import Actuator, Channel, Signals
 from sb3_hds.core.transforms.base import StatefulTransform
 from sb3_hds.errors import ParameterError
+from sb3_hds.wrappers.observations import extended_box, is_vector
 
 _STORES = ("raw", "executed")
 
@@ -20,31 +20,31 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
     """
     Abstract: maps the action of a policy to the command of the environment.
 
-    ``step`` adds to ``info``, where several layers are nested:
+    ``step`` adds to ``info``, also for nested layers:
 
     - ``raw_action``: the action of the policy, before the outermost layer
     - ``safe_action``: the command of the environment, after the innermost layer
     - ``correction``: the sum of the changes by all layers, in command units
     - ``constraint_cost``: the sum of the constraint violations of all layers
-    - ``executed_action``: the action that would have been executed unchanged, in the units of the
-      outermost layer's action space; the raw action where a layer has no such action
-    - ``stored_action``: the same, where the outermost layer has ``store="executed"``: the
-      action that a learner should store instead of its own
+    - ``executed_action``: the action that corresponds to the executed command, in the outermost
+      layer's action space; the raw action if a layer has no such inverse
+    - ``stored_action``: the same, if the outermost layer has ``store="executed"``: the action that
+      a learner should store instead of its own
 
-    :param env: its actions are a bounded Box with one axis
+    :param env: with a bounded Box of one axis as action space
     :param store: ``"raw"``, or ``"executed"``
-    :param arguments: of the constructor, recorded in ``env.spec`` so that the wrapper can be
-        rebuilt
+    :param arguments: the other arguments of the constructor, recorded in ``env.spec`` so that the
+        wrapper can be rebuilt
     :raises ParameterError: for other actions, or another ``store``
     """
 
-    #: whether commands may differ from actions
+    #: whether a command may differ from the action
     alters_commands: ClassVar[bool] = True
-    #: what ``store`` may be
+    #: allowed values of ``store``
     stores: ClassVar[tuple[str, ...]] = _STORES
 
-    def __init__(self, env: gymnasium.Env, store: str, arguments: Mapping[str, Any]) -> None:
-        gymnasium.utils.RecordConstructorArgs.__init__(self, **arguments)
+    def __init__(self, env: gymnasium.Env, store: str, **arguments: Any) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(self, store=store, **arguments)
         gymnasium.Wrapper.__init__(self, env)
         check_bounded(type(self), env.action_space)
         if store not in self.stores:
@@ -71,28 +71,28 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
         """:return: the command that would count as uncorrected"""
         return np.clip(action, self.commands.low, self.commands.high)
 
-    def meant_by(self, command: np.ndarray) -> np.ndarray:
-        """:return: the action that corresponds to a command: the inverse of :meth:`nominal`"""
+    def action_for(self, command: np.ndarray) -> np.ndarray:
+        """:return: the action whose command this is: the inverse of :meth:`nominal`"""
         return command
 
     def begin(self, obs: Any) -> None:
-        """Called with the first observation of an episode."""
+        """Start an episode with its first observation."""
         self._obs = vector(self.env.observation_space, obs)
 
-    def arrive(self, obs: Any, command: np.ndarray) -> None:
-        """Called after a step with the command and the observation it led to."""
+    def observe(self, obs: Any, command: np.ndarray) -> None:
+        """Take note of a command and of the observation that followed it."""
         self._obs = vector(self.env.observation_space, obs)
 
-    def seen(self, obs: Any) -> Any:
+    def observation(self, obs: Any) -> Any:
         """:return: what the policy sees"""
         return obs
 
     def cost(self) -> float:
-        """:return: by how much the latest observation violates the constraints of the layer"""
+        """:return: violation of the layer's constraints at the latest observation"""
         return 0.0
 
-    def charged(self) -> float:
-        """:return: the penalty on the latest command, subtracted from the reward"""
+    def penalty(self) -> float:
+        """:return: penalty on the latest command, to subtract from the reward"""
         return 0.0
 
     def extra_info(self) -> dict[str, Any]:
@@ -104,7 +104,7 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
     ) -> tuple[Any, dict[str, Any]]:
         obs, info = self.env.reset(seed=seed, options=options)
         self.begin(obs)
-        return self.seen(obs), info
+        return self.observation(obs), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """
@@ -115,16 +115,16 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
         command = self._rounded(self.decide(raw))
         correction = command - self.nominal(raw)
         obs, reward, terminated, truncated, info = self.env.step(command)
-        self.arrive(obs, command)
-        info = self._informed(raw, command, correction, info)
-        return self.seen(obs), float(reward) - self.charged(), terminated, truncated, info
+        self.observe(obs, command)
+        info = self._extended_info(raw, command, correction, info)
+        return self.observation(obs), float(reward) - self.penalty(), terminated, truncated, info
 
     def _rounded(self, command: np.ndarray) -> np.ndarray:
-        """The command as the environment takes it; rounding must not leave its limits."""
+        """The command in the environment's data type; rounding must not leave its limits."""
         space = self.commands
         return np.clip(command.astype(space.dtype), space.low, space.high)
 
-    def _informed(
+    def _extended_info(
         self,
         raw: np.ndarray,
         command: np.ndarray,
@@ -143,7 +143,7 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
         info.pop("stored_action", None)
         executed = raw
         if "executed" in self.stores:
-            executed = self.meant_by(below.get("executed_action", command))
+            executed = self.action_for(below.get("executed_action", command))
         info["executed_action"] = executed.astype(self.action_space.dtype)
         if self.store == "executed":
             info["stored_action"] = info["executed_action"]
@@ -152,9 +152,9 @@ class ActionLayer(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs, abc.
 
 class TransformLayer(ActionLayer):
     """
-    Abstract: a layer around a :class:`~sb3_hds.core.StatefulTransform`, which can wrap a twin, too.
+    Abstract: applies a :class:`~sb3_hds.core.StatefulTransform`, which can also wrap a twin.
 
-    :param transform: what the layer computes
+    :param transform: from actions to commands
     :raises ParameterError: if it does not fit the environment
     """
 
@@ -163,9 +163,9 @@ class TransformLayer(ActionLayer):
         env: gymnasium.Env,
         transform: StatefulTransform,
         store: str,
-        arguments: Mapping[str, Any],
+        **arguments: Any,
     ) -> None:
-        super().__init__(env, store, arguments)
+        super().__init__(env, store, **arguments)
         self._transform = transform
         self._below = signals_of(env)
         remembered = transform.remembers(self._below)
@@ -173,16 +173,16 @@ class TransformLayer(ActionLayer):
         if transform.observed and remembered:
             self.observation_space = with_channels(self, env.observation_space, remembered)
         self._appends = bool(transform.observed and remembered)
-        self._charged = 0.0
+        self._penalty = 0.0
 
     @property
     def twin_transform(self) -> StatefulTransform | None:
-        """The transform that also wraps the twin; None where there is no exact one."""
+        """The transform that wraps the twin alike; None if there is no exact one."""
         return self._transform
 
     @property
     def twin_transforms(self) -> list[tuple[str, StatefulTransform]]:
-        """The transforms from here to the environment, by class of the layer."""
+        """Layer classes and transforms, from here down to the environment."""
         layers, env = [], self
         while isinstance(env, gymnasium.Wrapper):
             if isinstance(env, TransformLayer) and env.twin_transform is not None:
@@ -192,19 +192,19 @@ class TransformLayer(ActionLayer):
 
     def decide(self, action: np.ndarray) -> np.ndarray:
         given = action, self._obs, self._memory, self._below
-        self._charged = float(self._transform.cost(*given))
+        self._penalty = float(self._transform.cost(*given))
         command, self._memory = self._transform.act(*given)
         return command
 
-    def charged(self) -> float:
-        return self._charged
+    def penalty(self) -> float:
+        return self._penalty
 
     def begin(self, obs: Any) -> None:
         super().begin(obs)
         if not self._transform.persists:
             self._memory = self._transform.start(self._obs, self._below)
 
-    def seen(self, obs: Any) -> Any:
+    def observation(self, obs: Any) -> Any:
         if not self._appends:
             return obs
         assert self.observation_space.dtype is not None
@@ -213,8 +213,7 @@ class TransformLayer(ActionLayer):
 
 def check_bounded(layer: type, space: spaces.Space) -> None:
     """:raises ParameterError: unless actions are a bounded Box with one axis"""
-    fine = isinstance(space, spaces.Box) and len(space.shape) == 1 and space.is_bounded()
-    if not fine:
+    if not (is_vector(space) and space.is_bounded()):
         raise ParameterError(
             f"{layer.__name__} takes environments whose actions are a bounded Box with one axis, "
             f"got {space}. Flatten them, or give them limits, below this wrapper."
@@ -235,16 +234,16 @@ def check_action(env: gymnasium.Env, action: Any) -> np.ndarray:
 
 
 def vector(space: spaces.Space, obs: Any) -> np.ndarray:
-    """:return: the observation in double precision, empty where it is no vector"""
+    """:return: the observation in double precision; empty if it is not a vector"""
     return np.asarray(obs, np.float64) if is_vector(space) else np.zeros(0)
 
 
 def signals_of(env: gymnasium.Env) -> Signals:
-    """:return: the limits of an environment's actions and, where they are a vector, observations"""
+    """:return: the limits of an environment's actions and, if they are a vector, observations"""
     space, seen = env.action_space, env.observation_space
     assert isinstance(space, spaces.Box)
     actuators = tuple(Actuator(f"action[{i}]", "1", *e) for i, e in enumerate(_ends(space)))
-    ends = _ends(seen) if isinstance(seen, spaces.Box) and is_vector(seen) else []
+    ends = _ends(seen) if is_vector(seen) else []
     channels = tuple(Channel(f"obs[{i}]", "1", *e) for i, e in enumerate(ends))
     return Signals(actuators, channels)
 
@@ -256,22 +255,14 @@ def with_channels(
     :return: the observation space with ``added`` appended
     :raises ParameterError: unless observations are a Box with one axis
     """
-    if not isinstance(space, spaces.Box) or not is_vector(space):
+    if not is_vector(space):
         switch = "observe_state" in inspect.signature(type(env).__init__).parameters
         or_else = ", or pass observe_state=False: then the task is no longer Markov" * switch
         raise ParameterError(
             f"{type(env).__name__} adds to observations that are a Box with one axis, got {space}. "
             f"Flatten them below (gymnasium.wrappers.FlattenObservation){or_else}."
         )
-    dtype = np.result_type(space.dtype, np.float32) if space.dtype.kind == "f" else np.float32
-    low = np.concatenate([space.low, [c.low for c in added]]).astype(dtype)
-    high = np.concatenate([space.high, [c.high for c in added]]).astype(dtype)
-    return spaces.Box(low, high, dtype=dtype)
-
-
-def is_vector(space: spaces.Space) -> bool:
-    """:return: whether it is a Box with one axis"""
-    return isinstance(space, spaces.Box) and len(space.shape) == 1
+    return extended_box(space, [c.low for c in added], [c.high for c in added])
 
 
 def _ends(space: spaces.Box) -> list[tuple[float, float]]:

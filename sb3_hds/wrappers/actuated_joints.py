@@ -1,4 +1,4 @@
-"""The joint that each actuator of a MuJoCo model drives, and the place of its state."""
+"""The joint that each actuator of a MuJoCo model drives, and where its state is."""
 
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from sb3_hds.errors import EnvironmentMismatchError
 _JOINT_TRANSMISSION = 0
 _ONE_AXIS = (2, 3)
 _AFFINE = 1
-#: attribute of an environment whose commands are positions of its joints already
+#: attribute of an environment that says that its commands are joint positions
 COMMANDS_POSITIONS = "commands_positions"
 
 Angles = Float[np.ndarray, "*batch act"]
@@ -20,16 +20,16 @@ Angles = Float[np.ndarray, "*batch act"]
 
 class ActuatedJoints(NamedTuple):
     """
-    The joints that are driven, in the order of the actuators, which need not be that of the state:
-    Ant's first actuator drives its last leg.
+    The actuated joints, in the order of the actuators, which need not be that of the state: Ant's
+    first actuator drives its last leg.
 
     :param names: of the joints
-    :param position: of each in ``qpos``
-    :param velocity: of each in ``qvel``
+    :param position: index of each in ``qpos``
+    :param velocity: index of each in ``qvel``
     :param n_positions: length of ``qpos``
-    :param lower: end of its range [rad] or [m]; -inf where it has none
-    :param upper: likewise
-    :param rest: where the model puts it at first
+    :param lower: lower end of each range [rad] or [m]; -inf if it has none
+    :param upper: upper end; inf if it has none
+    :param rest: initial position in the model [rad] or [m]
     """
 
     names: tuple[str, ...]
@@ -42,7 +42,7 @@ class ActuatedJoints(NamedTuple):
 
     def of_state(self, state: Float[np.ndarray, "*batch state"]) -> tuple[Angles, Angles]:
         """
-        :param state: ``qpos`` and ``qvel`` in a row, as ``MujocoEnv.state_vector`` returns them
+        :param state: ``qpos`` followed by ``qvel``, as from ``MujocoEnv.state_vector``
         :return: positions and velocities of the joints
         """
         return state[..., self.position], state[..., self.n_positions + self.velocity]
@@ -51,8 +51,8 @@ class ActuatedJoints(NamedTuple):
 def actuated_joints(model: Any) -> ActuatedJoints:
     """
     :param model: an ``MjModel``
-    :raises EnvironmentMismatchError: if an actuator drives something else than one joint with one
-        axis (a tendon, a ball, a site)
+    :raises EnvironmentMismatchError: if an actuator drives anything but a hinge or a slide (a
+        tendon, a ball joint, a site)
     """
     joints = np.asarray(model.actuator_trnid)[:, 0]
     by_joint = np.asarray(model.actuator_trntype) == _JOINT_TRANSMISSION
@@ -60,8 +60,8 @@ def actuated_joints(model: Any) -> ActuatedJoints:
     if not fine.all():
         names = ", ".join(model.actuator(int(i)).name or str(i) for i in np.flatnonzero(~fine))
         raise EnvironmentMismatchError(
-            f"A position can be tracked where an actuator drives one hinge or slide; these do not: "
-            f"{names}. Let the oscillators command the actuators directly: control='direct'."
+            "Positions can be tracked only if each actuator drives one hinge or slide; these do "
+            f"not: {names}. Let the oscillators command the actuators directly: control='direct'."
         )
     limited = np.asarray(model.jnt_limited)[joints].astype(bool)
     ranges = np.asarray(model.jnt_range)[joints]
@@ -78,7 +78,7 @@ def actuated_joints(model: Any) -> ActuatedJoints:
 
 
 def commands_positions(model: Any) -> bool:
-    """:return: whether an actuator is a servo, whose commands are positions"""
+    """:return: whether any actuator is a position servo"""
     affine = np.asarray(model.actuator_biastype) == _AFFINE
     return bool(np.any(affine & (np.asarray(model.actuator_biasprm)[:, 1] != 0.0)))
 
@@ -87,18 +87,18 @@ def refuse_servos(model: Any, declared: Any) -> None:
     """
     :param model: an ``MjModel``
     :param declared: the attribute ``commands_positions`` of the environment
-    :raises EnvironmentMismatchError: if commands are positions, which are tracked already
+    :raises EnvironmentMismatchError: if commands are positions, which servos track already
     """
     if declared or commands_positions(model):
         raise EnvironmentMismatchError(
             "The commands of this environment are positions: its own servos track them, and a "
-            "second loop around those would not arrive. Let the oscillators be the commands: "
+            "second loop around those would not converge. Let the oscillators be the commands: "
             "control='direct'."
         )
 
 
 def joints_of(env: gymnasium.Env) -> ActuatedJoints | None:
-    """:return: of the MuJoCo environment inside; None if there is none"""
+    """:return: the joints of the MuJoCo environment inside; None if it is not of MuJoCo"""
     model = getattr(env.unwrapped, "model", None)
     return actuated_joints(model) if hasattr(model, "actuator_trnid") else None
 
@@ -107,7 +107,7 @@ def track(
     target: Angles, position: Angles, velocity: Angles, kp: Angles | float, kd: Angles | float
 ) -> Angles:
     r"""
-    :math:`k_p (q^* - q) - k_d\,\dot q`, in the unit of the actuators' commands, not clipped.
+    :math:`k_p (q^* - q) - k_d\,\dot q`, in the unit of the commands, not clipped.
 
     :param kp: command per rad or m
     :param kd: command per rad/s or m/s

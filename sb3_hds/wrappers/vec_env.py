@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
@@ -15,8 +16,8 @@ from sb3_hds.errors import ParameterError
 
 PartialReset = Callable[[np.ndarray], tuple[Any, Any]]
 
-# How vectorised environments call what the ended episode observed last: Gymnasium's name, and that
-# of Gymnasium before 1.1 and of some simulators.
+# Keys of the last observation of an ended episode: Gymnasium's, and that of Gymnasium before 1.1
+# and of some simulators.
 _FINAL_OBS = ("final_obs", "final_observation")
 
 
@@ -24,30 +25,31 @@ class GymnasiumVecEnv(VecEnv):
     """
     A Gymnasium ``VectorEnv`` as a ``VecEnv`` of SB3.
 
-    SB3 stores a transition for each copy and each step, with the last observation of an ended
-    episode in ``infos[i]["terminal_observation"]`` and a time-out as
-    ``infos[i]["TimeLimit.truncated"]``. What Gymnasium gives depends on its autoreset mode:
+    SB3 stores one transition per copy and step, and expects the last observation of an ended
+    episode in ``infos[i]["terminal_observation"]`` and time-outs in
+    ``infos[i]["TimeLimit.truncated"]``. What Gymnasium returns depends on its autoreset mode:
 
     - ``SAME_STEP``: the last observation is ``infos["final_obs"]``.
-    - ``NEXT_STEP``: the step after an end ignores the action and returns a first observation. A
-      learner that stored this step would learn a transition that does not exist. Here, copies that
-      ended are reset at once, so that there is no such step.
-    - ``DISABLED``: likewise.
+    - ``NEXT_STEP``: the step after an end ignores the action and returns a first observation. This
+      is not a transition and must not be stored. Here, copies that ended are reset at once, so that
+      there is no such step.
+    - ``DISABLED``: ended copies are reset at once, too.
 
-    The last two need an environment that resets some of its copies only: Gymnasium's own do, by
-    ``reset(options={"reset_mask": ...})``. Whether the other copies stand still is checked.
+    The last two need an environment that can reset some of its copies only: Gymnasium's own do, by
+    ``reset(options={"reset_mask": ...})``. It is checked that the other copies do not change.
 
     ``infos[i]["episode"]`` is return, length and time of an ended episode, as from SB3's
-    ``Monitor``, unless the environment gives its own, of the same length. As in Gymnasium, asking
-    the copies of an ``AsyncVectorEnv`` for an attribute that they do not have ends their processes.
+    ``Monitor``, unless the environment returns its own, of the same length. As in Gymnasium, asking
+    the copies of an ``AsyncVectorEnv`` for an attribute that they lack ends their processes.
 
     :param env: as from ``gymnasium.make_vec``
-    :param autoreset_mode: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``; None: what the
-        environment says in its ``metadata``
-    :param partial_reset: which copies, shape ``(n_envs,)``, to what ``env.reset`` returns, where
-        the environment has no ``reset_mask``; for a single copy, ``lambda which: env.reset()``
-    :raises ParameterError: for an unknown mode, or an environment that would have a step after
-        each end which is no transition
+    :param autoreset_mode: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``; None: that
+        of the environment's ``metadata``
+    :param partial_reset: takes a mask of copies, shape ``(n_envs,)``, and returns what
+        ``env.reset`` does, for environments without ``reset_mask``; for a single copy, ``lambda
+        mask: env.reset()``
+    :raises ParameterError: for an unknown mode, or an environment whose step after an end cannot be
+        avoided
     """
 
     def __init__(
@@ -60,7 +62,7 @@ class GymnasiumVecEnv(VecEnv):
         if not isinstance(env, VectorEnv):
             raise ParameterError(
                 f"GymnasiumVecEnv takes a gymnasium.vector.VectorEnv, got {type(env).__name__}. "
-                "A single environment needs no adapter: SB3 vectorises it by itself."
+                "A single environment needs no adapter: SB3 vectorises it."
             )
         self.env = env
         self.autoreset_mode = _mode_of(env, autoreset_mode)
@@ -75,7 +77,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def reset(self) -> Any:
         """
-        Begin an episode in every copy.
+        Start an episode in every copy.
 
         :raises ParameterError: for options that differ between copies
         """
@@ -90,16 +92,16 @@ class GymnasiumVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """:raises RuntimeError: if the environment does not keep to its autoreset mode"""
+        """:raises RuntimeError: if the environment violates its autoreset mode"""
         obs, rewards, terminated, truncated, raw_infos = self.env.step(self._actions)
         obs, rewards = copied(obs), np.asarray(rewards, np.float32)
         terminated, truncated = np.asarray(terminated, bool), np.asarray(truncated, bool)
         infos, dones = infos_of(raw_infos, self.num_envs), terminated | truncated
         if dones.any() and self.autoreset_mode is AutoresetMode.SAME_STEP:
-            last = [self._taken_apart(infos, i) if dones[i] else None for i in range(len(dones))]
+            last = [self._split_final(infos, i) if dones[i] else None for i in range(len(dones))]
         else:
             last = [obs_of(obs, i) if dones[i] else None for i in range(len(dones))]
-            obs = self._restarted(obs, dones) if dones.any() else obs
+            obs = self._reset_ended(obs, dones) if dones.any() else obs
         self._returns += rewards
         self._lengths += 1
         for i, info in enumerate(infos):
@@ -110,33 +112,33 @@ class GymnasiumVecEnv(VecEnv):
         self._returns[dones], self._lengths[dones] = 0.0, 0
         return obs, rewards, dones, infos
 
-    def _taken_apart(self, infos: list[dict], i: int) -> Any:
-        """Final and first observation and info of a copy that ended in ``SAME_STEP``."""
+    def _split_final(self, infos: list[dict], i: int) -> Any:
+        """The final observation of a copy that ended in ``SAME_STEP``; sorts its infos."""
         both = infos[i]
         name = next((name for name in _FINAL_OBS if name in both), None)
         if name is None:
             raise RuntimeError(
-                f"{self.env} resets in the same step, but infos has no 'final_obs' for the copy "
-                f"{i}, which ended: its last observation is lost, and with it the value of what "
-                "would have come after a time-out. The environment has to return it."
+                f"{self.env} resets in the same step, but infos has no 'final_obs' for copy {i}, "
+                "which ended: without its last observation, the value after a time-out cannot be "
+                "bootstrapped. The environment has to return it."
             )
         last = both.pop(name)
         infos[i] = dict(both.pop("final_info", None) or {})
         self.reset_infos[i] = both
         return copied(last)
 
-    def _restarted(self, before: Any, which: np.ndarray) -> Any:
+    def _reset_ended(self, before: Any, which: np.ndarray) -> Any:
         """
-        :param before: what all copies observe
-        :param which: of them shall begin anew
-        :return: what all copies observe then
+        :param before: observations of all copies
+        :param which: mask of the copies to reset
+        :return: observations of all copies after the reset
         """
         obs, raw_infos = self._partial_reset(which.copy())
         if not same_rows(before, obs, ~which):
             raise RuntimeError(
                 f"{self.env} was asked to reset the copies {np.flatnonzero(which).tolist()}, and "
-                'others changed as well: it knows no reset(options={"reset_mask": ...}), or '
-                "partial_reset does not keep to it. Use autoreset_mode=SAME_STEP, or pass "
+                'others changed as well: it has no reset(options={"reset_mask": ...}), or '
+                "partial_reset ignores the mask. Use autoreset_mode=SAME_STEP, or pass "
                 "partial_reset=."
             )
         infos = infos_of(raw_infos, self.num_envs)
@@ -147,18 +149,18 @@ class GymnasiumVecEnv(VecEnv):
     def _reset_by_mask(self, which: np.ndarray) -> tuple[Any, Any]:
         try:
             return self.env.reset(options={"reset_mask": which})
-        # Gymnasium's normalisation refuses with one or the other, by its version.
+        # Gymnasium's normalisation raises one or the other, depending on its version.
         except (ValueError, AssertionError) as error:
             raise RuntimeError(
-                f"{self.env} could not reset some of its copies alone ({error}). If a wrapper of "
+                f"{self.env} could not reset some of its copies only ({error}). If a wrapper of "
                 "Gymnasium normalises there, put SB3's VecNormalize above this adapter instead; "
                 "otherwise use autoreset_mode=SAME_STEP, or pass partial_reset=."
             ) from error
 
     def _episode(self, i: int, statistics: Any) -> dict[str, float]:
         """
-        :param statistics: of the episode by the environment; Gymnasium's vectorised
-            ``RecordEpisodeStatistics`` begins to count anew in all copies where one is reset
+        :param statistics: of the environment; Gymnasium's vectorised ``RecordEpisodeStatistics``
+            restarts its counts in all copies when one is reset
         """
         if isinstance(statistics, dict) and statistics.get("l") == self._lengths[i]:
             return statistics
@@ -176,17 +178,17 @@ class GymnasiumVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """
-        :return: of each copy asked for; of the whole, where it has no environments of their own
+        :return: one for each copy; that of the vectorised environment if copies are no environments
         """
         if attr_name == "render_mode" or not isinstance(self.env.unwrapped, _OF_ENVS):
             values = [getattr(self.env, attr_name)] * self.env.num_envs
         else:
             values = self.env.unwrapped.get_attr(attr_name)
-        return [values[i] for i in self._which(indices)]
+        return [values[i] for i in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """:raises AttributeError: where the copies are no environments of their own"""
-        which, copies = self._which(indices), self._copies(attr_name)
+        """:raises AttributeError: if the copies are no environments of their own"""
+        which, copies = self._chosen(indices), self._copies(attr_name)
         everywhere = len(set(which)) == self.num_envs
         values = [value] * self.num_envs if everywhere else list(copies.get_attr(attr_name))
         for i in which:
@@ -201,10 +203,10 @@ class GymnasiumVecEnv(VecEnv):
         **method_kwargs: Any,
     ) -> list[Any]:
         """
-        :raises AttributeError: where the copies are no environments of their own
+        :raises AttributeError: if the copies are no environments of their own
         :raises NotImplementedError: for some of the copies of an ``AsyncVectorEnv``
         """
-        which, copies = self._which(indices), self._copies(method_name)
+        which, copies = self._chosen(indices), self._copies(method_name)
         if isinstance(copies, SyncVectorEnv):
             methods = [copies.envs[i].get_wrapper_attr(method_name) for i in which]
             return [method(*method_args, **method_kwargs) for method in methods]
@@ -219,16 +221,16 @@ class GymnasiumVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """:return: True for ``Monitor``, whose part this adapter plays; copies in other processes
-        do not tell about other wrappers"""
+        """:return: True for ``Monitor``, which this adapter replaces; False for other wrappers of
+        copies in other processes, which cannot be inspected"""
         if wrapper_class is Monitor:
-            return [True for _ in self._which(indices)]
+            return [True for _ in self._chosen(indices)]
         copies = self.env.unwrapped
         if not isinstance(copies, SyncVectorEnv):
-            return [False for _ in self._which(indices)]
-        return [_is_wrapped(copies.envs[i], wrapper_class) for i in self._which(indices)]
+            return [False for _ in self._chosen(indices)]
+        return [is_wrapped(copies.envs[i], wrapper_class) for i in self._chosen(indices)]
 
-    def _which(self, indices: VecEnvIndices) -> list[int]:
+    def _chosen(self, indices: VecEnvIndices) -> list[int]:
         return list(self._get_indices(indices))
 
     def _copies(self, name: str) -> SyncVectorEnv | AsyncVectorEnv:
@@ -250,19 +252,19 @@ def _mode_of(env: VectorEnv, chosen: str | AutoresetMode | None) -> AutoresetMod
         return AutoresetMode(mode)
     except ValueError:
         raise ParameterError(
-            f"{env} does not say how it resets: the autoreset mode is {mode!r}. Pass "
+            f"{env} does not declare how it resets: its autoreset mode is {mode!r}. Pass "
             "autoreset_mode='NextStep', 'SameStep' or 'Disabled'; if it returns the first "
             "observation of a new episode together with done, that is 'SameStep'."
         ) from None
 
 
 def _refuse_reset_steps(env: VectorEnv, mode: AutoresetMode) -> None:
-    """Whether a masked reset leaves no reset pending is known of Gymnasium's own only."""
+    """Only Gymnasium's own environments are known to leave no reset pending after a masked one."""
     bare = env.unwrapped
     if mode is AutoresetMode.SAME_STEP or isinstance(bare, SyncVectorEnv):
         return
     if isinstance(bare, AsyncVectorEnv):
-        # Its workers forget a pending reset only where they share memory (Gymnasium 1.4).
+        # Its workers drop a pending reset only with shared memory (Gymnasium 1.4).
         if not bare.shared_memory:
             raise ParameterError(
                 "An AsyncVectorEnv without shared memory resets copies a second time after "
@@ -278,7 +280,7 @@ def _refuse_reset_steps(env: VectorEnv, mode: AutoresetMode) -> None:
 
 
 def _seed_of(seeds: Sequence[int | None]) -> Any:
-    """Gymnasium counts up from one number, as ``VecEnv.seed`` does; not everybody takes lists."""
+    """One number where seeds count up, as ``VecEnv.seed`` sets them: not all take lists."""
     first = seeds[0]
     if first is None or list(seeds) != list(range(first, first + len(seeds))):
         return None if set(seeds) == {None} else list(seeds)
@@ -294,21 +296,12 @@ def _options_of(options: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     return dict(options[0]) or None
 
 
-def _is_wrapped(env: gymnasium.Env, wrapper_class: type[gymnasium.Wrapper]) -> bool:
-    layer = env
-    while isinstance(layer, gymnasium.Wrapper):
-        if isinstance(layer, wrapper_class):
-            return True
-        layer = layer.env
-    return False
-
-
 def infos_of(infos: Mapping[str, Any] | Sequence[Mapping[str, Any]], n: int) -> list[dict]:
     """
-    :param infos: by name one entry for each copy and, under ``_name``, which copies have it; or
-        already one dictionary for each copy (``DictInfoToList``)
+    :param infos: by name one entry per copy and, under ``_name``, the mask of copies that have it;
+        or one dictionary per copy already (``DictInfoToList``)
     :param n: number of copies
-    :return: one dictionary for each copy, with the names that it has
+    :return: one dictionary per copy, with the entries that it has
     """
     if not isinstance(infos, Mapping):
         return [dict(info) for info in infos]
@@ -324,27 +317,27 @@ def infos_of(infos: Mapping[str, Any] | Sequence[Mapping[str, Any]], n: int) -> 
 
 
 def obs_of(obs: Any, i: int) -> Any:
-    """:return: a copy of what the copy ``i`` observes"""
+    """:return: the observation of environment ``i``, copied"""
     if isinstance(obs, Mapping):
         return {name: obs_of(part, i) for name, part in obs.items()}
     return np.array(obs[i])
 
 
 def copied(obs: Any) -> Any:
-    """:return: the same in memory of its own: environments may write into theirs later"""
+    """:return: a deep copy: environments may reuse their buffers"""
     if isinstance(obs, Mapping):
         return {name: copied(part) for name, part in obs.items()}
     return np.array(obs)
 
 
 def same_rows(first: Any, second: Any, rows: np.ndarray) -> bool:
-    """:return: whether these copies observe the same in both"""
+    """:return: whether the observations of these copies are equal"""
     if isinstance(first, Mapping):
         return all(same_rows(part, second[name], rows) for name, part in first.items())
     return np.array_equal(np.asarray(first)[rows], np.asarray(second)[rows], equal_nan=True)
 
 
 def _one_each(value: Any, n: int) -> Any:
-    """Entries that do not come one for each copy belong to all of them."""
+    """Entries that are not one per copy hold for all copies."""
     each = isinstance(value, np.ndarray | Sequence) and not isinstance(value, str)
     return value if each and len(value) == n else [value] * n

@@ -93,7 +93,9 @@ def robot_of(env: VecEnv, control: str, joints: str, dt: float | None) -> Robot:
     """
     attribute, error = functools.partial(_attribute, env), EnvironmentMismatchError
     interval = (
-        interval_from(attribute, "The environment", error, drawn=True) if dt is None else float(dt)
+        interval_from(attribute, "The environment", error, from_fps=True)
+        if dt is None
+        else float(dt)
     )
     driven = _driven(env, control)
     if driven is None:

@@ -1,5 +1,5 @@
 """
-Studies: algorithms, environments and seeds, run, resumed and reported.
+Studies: run algorithms on environments with several seeds, resume, and report.
 
 Names are imported on first use.
 """

@@ -1,4 +1,4 @@
-"""What a study consists of: algorithms, environments and seeds, each run by a command of RL Zoo."""
+"""Definition of a study: algorithms, environments and seeds, each run by a command of RL Zoo."""
 
 import dataclasses
 import json
@@ -19,9 +19,9 @@ _ENV = ("id", "kwargs")
 
 class Run(NamedTuple):
     """
-    :param label: of the algorithm with its hyperparameters, in lower case: the zoo's folder
+    :param label: of the algorithm with its hyperparameters, in lower case: a folder of the zoo
     :param algo: id in the zoo
-    :param hyperparams: that replace those of its file
+    :param hyperparams: replace those of its file
     """
 
     label: str
@@ -33,19 +33,19 @@ class Run(NamedTuple):
 
     @property
     def place(self) -> Path:
-        """Where the zoo would put it, below its folder of logs."""
+        """The zoo's folder of the run, below its log folder."""
         return Path(self.label) / f"{self.env_name}_{self.seed + 1}"
 
     @property
     def env_name(self) -> str:
-        """Of the environment, in names of files."""
+        """Name of the environment in file names."""
         return self.env.replace("/", "-")
 
     def __str__(self) -> str:
         return f"{self.label} on {self.env}, seed {self.seed}"
 
 
-#: what starts a run, given it, its folder of logs, its clock and the folder of its checkpoint
+#: command of a run, given the run, its log folder, its clock file and the folder of its checkpoint
 Command = Callable[[Run, Path, Path, Path], Sequence[str]]
 
 
@@ -53,11 +53,11 @@ Command = Callable[[Run, Path, Path, Path], Sequence[str]]
 class Study:
     """
     :param name: of the study
-    :param runs: all of them
-    :param steps: of each, at most; None: as many as its time allows
-    :param minutes: of each, at most; None: as long as its steps take
-    :param every: steps from one evaluation to the next
-    :param episodes: of an evaluation
+    :param runs: of all algorithms, environments and seeds
+    :param steps: limit per run; None: no limit
+    :param minutes: limit per run; None: no limit
+    :param every: steps between evaluations
+    :param episodes: per evaluation
     """
 
     name: str
@@ -71,43 +71,43 @@ class Study:
     def load(cls, path: str | os.PathLike[str]) -> "Study":
         """
         :param path: of a yml file
-        :raises StudyError: for something in it that is unknown, missing or no number
+        :raises StudyError: for unknown, missing or invalid entries
         """
         file = Path(path)
         try:
-            told = yaml.safe_load(file.read_text())
+            content = yaml.safe_load(file.read_text())
         except yaml.YAMLError as error:
-            raise StudyError(f"'{path}' is no yml: {error}.") from error
+            raise StudyError(f"'{path}' is not valid yml: {error}.") from error
         except FileNotFoundError as error:
             raise StudyError(f"There is no study '{path}' (in {Path.cwd()}).") from error
-        _check_keys(f"'{path}'", told, _KEYS, ("algorithms", "envs", "budget"))
-        budget, evaluation = told["budget"], told.get("evaluation") or {}
+        _check_keys(f"'{path}'", content, _KEYS, ("algorithms", "envs", "budget"))
+        budget, evaluation = content["budget"], content.get("evaluation") or {}
         _check_keys("budget", budget, ("steps", "minutes"), ())
         _check_keys("evaluation", evaluation, ("every", "episodes"), ())
         steps, minutes = budget.get("steps"), budget.get("minutes")
         if steps is None and minutes is None:
             raise StudyError("budget needs steps, minutes, or both: {steps: 10000}.")
-        usual = max(1, steps // 20) if isinstance(steps, int) else 1_000
-        numbers = {"steps": steps, "minutes": minutes, "every": evaluation.get("every", usual)}
+        default = max(1, steps // 20) if isinstance(steps, int) else 1_000
+        numbers = {"steps": steps, "minutes": minutes, "every": evaluation.get("every", default)}
         numbers["episodes"] = evaluation.get("episodes", 10)
         for key, value in numbers.items():
-            whole = key == "minutes" or isinstance(value, int)
-            if value is not None and not (isinstance(value, int | float) and value > 0 and whole):
+            kinds = int | float if key == "minutes" else int
+            if value is not None and not (isinstance(value, kinds) and value > 0):
                 raise StudyError(f"{key} must be a number above 0, got {value!r}.")
-        return cls(name=str(told.get("name", file.stem)), runs=_runs(told), **numbers)
+        return cls(name=str(content.get("name", file.stem)), runs=_runs(content), **numbers)
 
     def settings(self, run: Run) -> dict[str, Any]:
-        """:return: what a run is made of, as it is written beside it"""
-        told = run._asdict() | {"steps": self.steps, "minutes": self.minutes}
-        told |= {"every": self.every, "episodes": self.episodes}
-        return json.loads(json.dumps(told))
+        """:return: the settings of a run, as stored in its folder"""
+        found = run._asdict() | {"steps": self.steps, "minutes": self.minutes}
+        found |= {"every": self.every, "episodes": self.episodes}
+        return json.loads(json.dumps(found))
 
 
 def zoo_command(study: Study, every: float = 5.0) -> Command:
     """
-    :param every: minutes from one checkpoint to the next; 0: none
-    :return: what starts a run, by the zoo's ``train``
-    :raises StudyError: if checkpoints are less than nothing apart
+    :param every: minutes between checkpoints; 0: no checkpoints
+    :return: makes the command of a run, the zoo's ``train``
+    :raises StudyError: if the interval is negative
     """
     if not every >= 0.0:
         raise StudyError(f"Minutes between checkpoints must be 0 or more, got {every:g}.")
@@ -139,23 +139,23 @@ def _check_keys(what: str, given: Any, known: Sequence[str], needed: Sequence[st
             raise StudyError(f"{what} lacks '{key}'.")
 
 
-def _runs(told: Mapping[str, Any]) -> tuple[Run, ...]:
-    seeds = told.get("seeds", 5)
+def _runs(content: Mapping[str, Any]) -> tuple[Run, ...]:
+    seeds = content.get("seeds", 5)
     seeds = range(seeds) if isinstance(seeds, int) else seeds
     runs = []
-    for given in told["algorithms"]:
+    for given in content["algorithms"]:
         entry: dict[str, Any] = {"algo": given} if isinstance(given, str) else given
         _check_keys("an entry of algorithms", entry, _ALGORITHM, ("algo",))
         label = str(entry.get("label", entry["algo"]))
         if label != label.lower() or "/" in label:
-            raise StudyError(f"A label is a folder of the zoo, in lower case, got '{label}'.")
-        for place in told["envs"]:
-            env: dict[str, Any] = {"id": place} if isinstance(place, str) else place
+            raise StudyError(f"A label names a folder of the zoo, in lower case, got '{label}'.")
+        for given_env in content["envs"]:
+            env: dict[str, Any] = {"id": given_env} if isinstance(given_env, str) else given_env
             _check_keys("an entry of envs", env, _ENV, ("id",))
             for seed in seeds:
                 hyperparams, kwargs = entry.get("hyperparams") or {}, env.get("kwargs") or {}
                 runs.append(Run(label, entry["algo"], hyperparams, env["id"], kwargs, int(seed)))
     places = [run.place for run in runs]
     if len(set(places)) < len(places):
-        raise StudyError("Two runs would have one folder: give each algorithm a label of its own.")
+        raise StudyError("Two runs would share a folder: give each algorithm its own label.")
     return tuple(runs)

@@ -1,4 +1,4 @@
-"""What came out of a study: one page of HTML, and its figures."""
+"""The report of a study: an HTML page and its figures."""
 
 import base64
 import io
@@ -20,7 +20,7 @@ from sb3_hds.experiments.study.runner import CLOCK, MARK, is_complete
 
 _REPS = 2_000
 _LEVEL = 0.95
-# Points of a curve along an axis.
+# Number of points of a curve.
 _N_POINTS = 100
 
 Scores = Float[np.ndarray, "seed env"]
@@ -28,9 +28,11 @@ Scores = Float[np.ndarray, "seed env"]
 
 class Reported(NamedTuple):
     """
-    :param page: of HTML, with everything in it
+    A written report.
+
+    :param page: self-contained HTML
     :param figures: PNG and PDF files beside it
-    :param n_runs: that are in it
+    :param n_runs: number of reported runs
     """
 
     page: Path
@@ -41,9 +43,9 @@ class Reported(NamedTuple):
 def results_of(study: Study, folder: str | os.PathLike[str]) -> pd.DataFrame:
     """
     :param folder: of its runs
-    :return: a row for each evaluation of each complete run: ``label``, ``env``, ``seed``,
+    :return: one row per evaluation of each complete run: ``label``, ``env``, ``seed``,
         ``timesteps``, ``seconds`` since the training began, evaluations included, and ``return``,
-        the mean of the episodes
+        the mean over episodes
     :raises StudyError: if no run is complete
     """
     root, rows = Path(folder), []
@@ -74,12 +76,12 @@ def write_report(
     study: Study, folder: str | os.PathLike[str], page: str | os.PathLike[str]
 ) -> Reported:
     """
-    Curves against steps and wall time, and where several algorithms have the same seeds and
+    Write curves against steps and wall time, and if several algorithms have the same seeds and
     environments, IQM, performance profiles and probabilities of improvement (Agarwal et al.,
     *Deep Reinforcement Learning at the Edge of the Statistical Precipice*, NeurIPS 2021, by their
-    library rliable), with intervals by the bootstrap over seeds.
+    library rliable), with bootstrap intervals over seeds.
 
-    :param page: HTML file to write; figures are written beside it
+    :param page: HTML file to write, with figures beside it
     :raises StudyError: if no run is complete
     :raises ImportError: without the extras ``report`` and ``zoo``
     """
@@ -112,10 +114,10 @@ def final_returns(table: pd.DataFrame) -> pd.DataFrame:
 
 def normalized_scores(table: pd.DataFrame) -> dict[str, Scores]:
     """
-    Final returns, from 0, the lowest evaluation of any run in that environment, to 1, the highest
-    final return there.
+    Normalise final returns per environment: 0 is the lowest evaluation of any run, 1 the highest
+    final return.
 
-    :return: by label, of those algorithms that have all environments with the same seeds
+    :return: by label, for algorithms that have all environments with the same seeds
     """
     last = final_returns(table)
     scores = np.zeros(len(last))
@@ -139,7 +141,7 @@ def normalized_scores(table: pd.DataFrame) -> dict[str, Scores]:
 def _interval(
     curves: Float[np.ndarray, "seed point"], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The mean over seeds, and the ends of its percentile interval."""
+    """Mean over seeds, and the ends of its percentile bootstrap interval."""
     drawn = rng.integers(0, len(curves), (_REPS, len(curves)))
     means = curves[drawn].mean(axis=1)
     tails = 50.0 * (1.0 - _LEVEL), 100.0 - 50.0 * (1.0 - _LEVEL)
@@ -148,7 +150,7 @@ def _interval(
 
 
 def _curves(table: pd.DataFrame) -> Any:
-    """A row for each environment: returns against steps, and against seconds."""
+    """One row per environment: returns against steps, and against wall time."""
     from matplotlib.figure import Figure
 
     envs = list(dict.fromkeys(table["env"]))
@@ -255,7 +257,7 @@ def _rows(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _hyperparams(runs: Sequence[Run], root: Path) -> dict[str, str]:
-    """Of the first run of each algorithm in each environment, as the zoo wrote them."""
+    """The zoo's file from the first run of each algorithm in each environment."""
     found: dict[str, str] = {}
     for run in runs:
         file = root / run.place / run.env_name / "config.yml"
@@ -286,12 +288,12 @@ pre { overflow-x: auto; font-size: 80% }
 <td>{{ row.mean }}</td><td>{{ row.interval }}</td><td>{{ row.steps }}</td>
 <td>{{ row.seconds }}</td></tr>
 {% endfor %}</table>
-<p>Of the last evaluation of each run. Intervals are of the mean over seeds, by the bootstrap.</p>
+<p>From the last evaluation of each run, with bootstrap intervals of the mean over seeds.</p>
 <h2>Curves</h2>
-<p>Means over seeds with {{ level }} % intervals. Wall time is that of training and evaluations;
-runs that shared a machine made each other slower.</p>
+<p>Means over seeds with {{ level }} % intervals. Wall time includes training and evaluations;
+runs that share a machine slow each other down.</p>
 <img alt="returns against steps and wall time" src="data:image/png;base64,{{ images.curves }}">
-{% if images.iqm %}<h2>All environments together</h2>
+{% if images.iqm %}<h2>All environments</h2>
 <p>Returns are normalised in each environment: 0 is the lowest evaluation of any run there, 1 the
 highest final return. Interquartile means, performance profiles and probabilities of improvement
 with {{ level }} % intervals by rliable's stratified bootstrap.</p>

@@ -25,47 +25,47 @@ class CPGPrior(TransformLayer):
     their targets, a residual on the commands, or their amplitudes and frequency. See
     :class:`~sb3_hds.core.Rhythm` for the equations.
 
-    Sine and cosine of the clock that all joints share are appended to the observation, and in the
-    third mode the amplitudes and their rates, so the task stays Markov.
+    Sine and cosine of the common phase are appended to the observation, and in the third mode the
+    amplitudes and their rates, so that the task stays Markov.
 
-    Actuators track their joints where these are known: from the entries of the observation that
-    ``position`` and ``velocity`` name, or else, in environments of MuJoCo, from the environment
-    itself. Elsewhere, with ``control="direct"``, and where commands are positions (MuJoCo's
-    position servos, or an environment whose attribute ``commands_positions`` is true), targets are
-    the commands. Commands are clipped to the action space below. The wrapper has a twin counterpart
-    unless joints are read from MuJoCo, whose state a twin does not have: name their entries.
+    A PD controller tracks the targets if joint states are known: from the entries ``position`` and
+    ``velocity`` of the observation, or else, in MuJoCo environments, from the simulator. Otherwise,
+    with ``control="direct"``, and where commands are positions (MuJoCo's position servos, or an
+    environment whose attribute ``commands_positions`` is true), targets are the commands. Commands
+    are clipped to the action space below. The wrapper has a twin counterpart unless joints are read
+    from MuJoCo, whose state a twin does not have: name their entries.
 
     ``info["command"]`` is the command of the environment below, ``info["target"]`` the target of
     the joints. Learners store the raw action, because a command has no unique action.
 
-    In a file of the zoo: ``env_wrapper: [{sb3_hds.wrappers.CPGPrior: {omega_swing: 3.9, ...}}]``.
-    :meth:`sb3_hds.OpenLoop.constants` has the gait of a search as these arguments.
+    In the zoo's yml: ``env_wrapper: [{sb3_hds.wrappers.CPGPrior: {omega_swing: 3.9, ...}}]``.
+    :meth:`sb3_hds.OpenLoop.constants` returns the gait that a search found as these arguments.
 
     Source: Bellegarda and Ijspeert, *CPG-RL*, RA-L 2022, for parameters; Raffin et al., *Learning
     to exploit elastic actuators for quadruped locomotion*, 2022, for offsets.
 
-    :param env: its actions are a bounded Box with one axis
+    :param env: with a bounded Box of one axis as action space
     :param mode: ``"offset"``, ``"residual"`` or ``"parameters"``
     :param omega_swing: [rad/s]
     :param omega_stance: [rad/s]; None: as ``omega_swing``
     :param amplitude: one per actuator, or one for all [rad]
-    :param offset: likewise [rad]
-    :param phase: likewise [rad]
-    :param kp: command per rad
-    :param kd: command per rad/s
-    :param action_range: of the offset [rad], or of the residual [commands]
+    :param offset: one per actuator, or one for all [rad]
+    :param phase: one per actuator, or one for all [rad]
+    :param kp: [command unit / rad]
+    :param kd: [command unit s / rad]
+    :param action_range: range of the offset [rad], or of the residual [command units]
     :param amplitude_factor: smallest and largest, for ``"parameters"``
-    :param frequency_factor: smallest and largest, likewise
-    :param amplitude_gain: how fast amplitudes follow [1/s]
+    :param frequency_factor: smallest and largest, for ``"parameters"``
+    :param amplitude_gain: convergence rate of the amplitudes [1/s]
     :param control: ``"track"``, ``"direct"``, or ``"auto"``
-    :param position: where the observation has the position of the joint of each actuator
-    :param velocity: likewise its velocity
-    :param dt: how long a step takes [s]; None: as the environment says
-    :param observe_state: whether the clock and the amplitudes are appended; without them, the task
+    :param position: index in the observation of each actuator's joint position
+    :param velocity: index of its velocity
+    :param dt: control interval [s]; default: the environment's own
+    :param observe_state: whether the phase and the amplitudes are appended; without them, the task
         is not Markov
     :param store: ``"raw"``
-    :raises EnvironmentMismatchError: for an environment that does not have what is asked for
-    :raises ParameterError: for arguments out of range, or of another number than the actuators
+    :raises EnvironmentMismatchError: for an environment without the joints to track
+    :raises ParameterError: for arguments out of range, or not one per actuator
     """
 
     stores: ClassVar[tuple[str, ...]] = ("raw",)
@@ -107,26 +107,30 @@ class CPGPrior(TransformLayer):
             "position": position,
             "velocity": velocity,
         }
-        arguments = passed_on | {
-            "omega_swing": omega_swing,
-            "omega_stance": omega_stance,
-            "control": control,
-            "dt": dt,
-            "observe_state": observe_state,
-            "store": store,
-        }
         check_bounded(type(self), env.action_space)
         n = spaces.flatdim(env.action_space)
         self._joints = _tracked(env, control, n, bool(position))
         rhythm = Rhythm(
             omega_swing=omega_swing,
             omega_stance=omega_swing if omega_stance is None else omega_stance,
-            dt=interval_of(env, EnvironmentMismatchError, drawn=True) if dt is None else float(dt),
+            dt=interval_of(env, EnvironmentMismatchError, from_fps=True)
+            if dt is None
+            else float(dt),
             observed=observe_state,
             **passed_on,
         )
         self.rhythm = rhythm.sized(n)
-        super().__init__(env, self.rhythm, store, arguments)
+        super().__init__(
+            env,
+            self.rhythm,
+            store,
+            omega_swing=omega_swing,
+            omega_stance=omega_stance,
+            control=control,
+            dt=dt,
+            observe_state=observe_state,
+            **passed_on,
+        )
         self.action_space = spaces.Box(-1.0, 1.0, (self.rhythm.n_actions,), np.float32)
         self._target = self._command = np.zeros(n)
 
@@ -155,7 +159,7 @@ class CPGPrior(TransformLayer):
 
 
 def _tracked(env: gymnasium.Env, control: str, n: int, named: bool) -> ActuatedJoints | None:
-    """:return: the joints that are read from MuJoCo, if they are to be"""
+    """:return: the joints to read from MuJoCo; None if there are none to read"""
     if control not in ("auto", "track", "direct"):
         raise EnvironmentMismatchError(
             f"CPGPrior(control={control!r}): control must be 'auto', 'track' or 'direct'."

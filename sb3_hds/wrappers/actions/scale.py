@@ -1,4 +1,4 @@
-"""A reduced range of commands, constant or on a schedule."""
+"""A reduced range of commands, constant or scheduled."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,12 +16,12 @@ class ActionScale(TransformLayer):
     Scales actions to a share of the command range, around its middle: a constant share, or one that
     follows a schedule over the steps of this copy of the environment.
 
-    The action space stays as it is. With a schedule, its progress from 0 to 1 is appended to
-    observations, and goes on over resets; a reset with a seed begins anew. An environment for
-    evaluation has a progress of its own, which begins at 0 as well: pass ``progress=1.0`` there, or
-    see :meth:`set_progress`.
+    The action space is unchanged. With a schedule, its progress from 0 to 1 is appended to
+    observations and continues across resets; a reset with a seed restarts it. An evaluation
+    environment has its own progress, which also starts at 0: pass ``progress=1.0`` there, or see
+    :meth:`set_progress`.
 
-    :param env: its actions are a bounded Box with one axis
+    :param env: with a bounded Box of one axis as action space
     :param scale: the share, above 0 and at most 1
     :param schedule: ``[[0, 0.3], [10_000, 1.0]]``: shares at step 0 and from step 10,000 on, linear
         between; instead of ``scale``
@@ -49,22 +49,23 @@ class ActionScale(TransformLayer):
                 f"ActionScale takes either a scale or a schedule, got scale={scale} and "
                 f"schedule={schedule}."
             )
-        arguments = {
-            "scale": scale,
-            "schedule": schedule,
-            "axes": axes,
-            "progress": progress,
-            "observe_state": observe_state,
-            "store": store,
-        }
         if not 0.0 <= progress <= 1.0:
             raise ParameterError(f"ActionScale(progress={progress}): progress is from 0 to 1.")
         if axes is not None and np.ndim(axes) != 1:
             raise ParameterError(f"ActionScale(axes={axes!r}): axes is a list of numbers: [0].")
         points = [[0.0, scale]] if schedule is None else schedule
-        self._scale = Scale(schedule=_pairs(points), axes=axes, observed=observe_state)
-        super().__init__(env, self._scale, store, arguments)
-        self._begin_at = self._memory
+        self._scale = Scale(schedule=_schedule_of(points), axes=axes, observed=observe_state)
+        super().__init__(
+            env,
+            self._scale,
+            store,
+            scale=scale,
+            schedule=schedule,
+            axes=axes,
+            progress=progress,
+            observe_state=observe_state,
+        )
+        self._start = self._memory
         self.set_progress(progress)
         self._share = self._shares()
 
@@ -72,18 +73,18 @@ class ActionScale(TransformLayer):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         if seed is not None:
-            self._memory = self._begin_at
+            self._memory = self._start
         return super().reset(seed=seed, options=options)
 
     def set_progress(self, progress: float) -> None:
         """
-        Set the progress of the schedule, for example to that of training, also for later resets
-        with a seed; reachable through ``VecEnv.env_method``. Without a schedule, nothing happens.
+        Set the progress of the schedule, for example to that of training; later resets with a seed
+        restart from it. Call it through ``VecEnv.env_method``. No effect without a schedule.
 
         :param progress: from 0 to 1
         """
         if self._scale.length:
-            self._memory = self._begin_at = np.array([np.clip(progress, 0.0, 1.0)])
+            self._memory = self._start = np.array([np.clip(progress, 0.0, 1.0)])
 
     def decide(self, action: np.ndarray) -> np.ndarray:
         self._share = self._shares()
@@ -92,7 +93,7 @@ class ActionScale(TransformLayer):
     def nominal(self, action: np.ndarray) -> np.ndarray:
         return self._middle + self._share * (super().nominal(action) - self._middle)
 
-    def meant_by(self, command: np.ndarray) -> np.ndarray:
+    def action_for(self, command: np.ndarray) -> np.ndarray:
         wanted = self._middle + (command - self._middle) / self._share
         return np.clip(wanted, self.commands.low, self.commands.high)
 
@@ -104,7 +105,7 @@ class ActionScale(TransformLayer):
         return 0.5 * (self.commands.low.astype(float) + self.commands.high)
 
 
-def _pairs(schedule: Any) -> list[list[float]]:
+def _schedule_of(schedule: Any) -> list[list[float]]:
     """
     :return: steps and shares
     :raises ParameterError: for anything but pairs of numbers

@@ -14,7 +14,7 @@ class Report:
 
     :param subject: what was checked, and on how much data
     :param problems: one paragraph each: what was measured, why it matters, what to do
-    :param notes: what could not be checked, and other remarks
+    :param notes: what could not be checked, and further remarks
     """
 
     subject: str
@@ -43,7 +43,7 @@ def counted(n: int, what: str) -> str:
 
 
 def name_of(env: Any) -> str:
-    """:return: the id of an environment, or else what it is made of"""
+    """:return: the id of an environment, or else its class"""
     spec = getattr(env, "spec", None)
     if spec is not None:
         return spec.id

@@ -10,20 +10,21 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_hds.errors import ParameterError
-from sb3_hds.wrappers.checks.ends_seen import End, Seen, ends_of_env, ends_of_vec_env, is_same
+from sb3_hds.wrappers.checks.ends_seen import Seen, ends_of_env, ends_of_vec_env, is_same
 from sb3_hds.wrappers.checks.report import Report, counted, name_of
-from sb3_hds.wrappers.episodes.step_limit import Limit, limits_of, own_limit, step_limit_of
+from sb3_hds.wrappers.episodes import Limit, limits_of, own_limit, step_limit_of
 from sb3_hds.wrappers.vec_env import GymnasiumVecEnv
 
-# Steps that are made where no limit is known.
-_USUAL = 2_000
-# Ends after equally many steps that are no coincidence, if they are half of all; or so many times
-# those after any number of steps in the last fifth before, and those after any other number.
+# Steps to sample if no limit is known.
+_DEFAULT_STEPS = 2_000
+# Ends after the same number of steps are a limit if there are at least so many, and they are half
+# of all ends, or outnumber those of any length in the last fifth before, and of any other length,
+# by these factors.
 _FEWEST = 3
 _THAN_BEFORE, _THAN_ANY = 3.0, 1.5
-# Where layers of vectorised environments keep their limit; copies keep it under the first name.
+# Attributes that hold the limit of a vectorised layer; single environments use the first.
 _NAMES = ("_max_episode_steps", "max_episode_steps")
-# What Python says where an environment keeps to Gym before 0.26.
+# Messages of Python if an environment has the interface of Gym before 0.26.
 _OLD_SIGNS = ("values to unpack", "unexpected keyword argument 'seed'")
 
 
@@ -35,29 +36,29 @@ def check_truncation(
     env: gymnasium.Env | VecEnv | VectorEnv, *, n_steps: int | None = None, seed: int = 0
 ) -> TruncationReport:
     r"""
-    Find out whether a time-out reaches the learner as a truncation.
+    Check that time-outs reach the learner as truncations.
 
-    A learner bootstraps the value of the last observation at a truncation, and takes 0 at a
-    termination. A time limit that arrives as a termination makes values wrong, silently: those of a
-    constant reward of 1 by a factor of :math:`1 / (1 - \gamma^n)` for a limit of ``n`` steps.
+    A learner bootstraps the value of the last observation at a truncation, and uses 0 at a
+    termination. A time limit reported as a termination silently biases values: those of a constant
+    reward of 1 by a factor of :math:`1 / (1 - \gamma^n)` for a limit of ``n`` steps.
 
     Episodes are sampled with random actions. The meaning of an end cannot be observed, but ends
     that recur after the same number of steps are a time limit, unless observations contain the
-    time. A limit outside a shorter one, which never acts, is found in the stack of wrappers, or for
-    copies in other processes from the lengths of episodes. The environment is reset and stepped,
-    and not closed.
+    time. A limit around a shorter one, which never takes effect, is found in the stack of wrappers,
+    or for copies in other processes from episode lengths. The environment is reset and stepped, and
+    not closed.
 
-    :param env: an environment, an SB3 ``VecEnv`` of anybody's, or a Gymnasium ``VectorEnv`` in any
-        autoreset mode, wrapped as the learner gets it
-    :param n_steps: at most so many; None: four episodes of the time limit in each copy, or 2,000
-    :param seed: of starts and actions
-    :raises ParameterError: for anything else, or no steps
+    :param env: an environment, an SB3 ``VecEnv``, or a Gymnasium ``VectorEnv`` in any autoreset
+        mode, wrapped as for the learner
+    :param n_steps: at most; None: four episodes of the time limit in each copy, or 2,000
+    :param seed: of initial states and actions
+    :raises ParameterError: for anything else, or fewer than one step
     """
     if n_steps is not None and n_steps < 1:
         raise ParameterError(f"check_truncation(n_steps={n_steps}): at least one step is needed.")
     if isinstance(env, VectorEnv):
-        return _of_vector_env(env, n_steps, seed)
-    if isinstance(env, VecEnv):
+        problems, notes, seen = _of_vector_env(env, n_steps, seed)
+    elif isinstance(env, VecEnv):
         problems, notes, seen = _of_vec_env(env, n_steps, seed)
     elif isinstance(env, gymnasium.Env):
         problems, notes, seen = _of_env(env, n_steps, seed)
@@ -72,7 +73,7 @@ def check_truncation(
 def _of_env(env: gymnasium.Env, n_steps: int | None, seed: int) -> tuple[list, list, Seen]:
     limit = step_limit_of(env)
     try:
-        seen = ends_of_env(env, n_steps or 4 * (limit or _USUAL // 4), seed)
+        seen = ends_of_env(env, n_steps or 4 * (limit or _DEFAULT_STEPS // 4), seed)
     except (ValueError, TypeError) as error:
         if not any(sign in str(error) for sign in _OLD_SIGNS):
             raise
@@ -91,27 +92,26 @@ def _of_vec_env(env: VecEnv, n_steps: int | None, seed: int) -> tuple[list, list
     stacks, copies = _stacks(env)
     known = [min(map(_steps_of, stack)) for stack in stacks if stack]
     limit = max(filter(None, known or map(step_limit_of, copies)), default=None)
-    seen = ends_of_vec_env(env, n_steps or env.num_envs * 4 * (limit or _USUAL // 4), seed)
+    seen = ends_of_vec_env(env, n_steps or env.num_envs * 4 * (limit or _DEFAULT_STEPS // 4), seed)
     problems = _missing_keys(seen) + _lost_observations(env, seen)
-    if _tells_time_outs(seen):
+    if _marks_time_outs(seen):
         problems += _looks_like_a_limit(seen, limit) + _never_acts(stacks, env, seen)
     problems += _nothing_ended(seen)
     return problems, [] if problems else _unseen(seen, limit), seen
 
 
-def _of_vector_env(env: VectorEnv, n_steps: int | None, seed: int) -> TruncationReport:
-    seen = Seen([], 0, False)
+def _of_vector_env(env: VectorEnv, n_steps: int | None, seed: int) -> tuple[list, list, Seen]:
     try:
         adapted = GymnasiumVecEnv(env)
         problems, notes, seen = _of_vec_env(adapted, n_steps, seed)
     except (ParameterError, RuntimeError) as error:
-        return TruncationReport(_subject(env, seen), [str(error)], [])
+        return [str(error)], [], Seen([], 0, False)
     if adapted.autoreset_mode is AutoresetMode.NEXT_STEP:
         notes.append(
             "In NEXT_STEP mode the step after an end ignores the action and is no transition. "
             "GymnasiumVecEnv(env) leaves it out; a learner of your own must, too."
         )
-    return TruncationReport(_subject(env, seen), problems, notes)
+    return problems, notes, seen
 
 
 def _only_in_info(seen: Seen) -> list[str]:
@@ -119,15 +119,15 @@ def _only_in_info(seen: Seen) -> list[str]:
     if not n:
         return []
     return [
-        f"{counted(n, 'time-out')} of {counted(len(seen.ends), 'end')} stood only in "
-        "info['TimeLimit.truncated'], and step() returned terminated=True. SB3 writes this entry "
-        "itself, from what step() returns, so the time-out is taken for a failure. Return "
+        f"{counted(n, 'time-out')} of {counted(len(seen.ends), 'end')} came only as "
+        "info['TimeLimit.truncated'], and step() returned terminated=True. SB3 sets this entry "
+        "itself from what step() returns, so the time-out counts as a failure. Return "
         "truncated=True and terminated=False."
     ]
 
 
 def _looks_like_a_limit(seen: Seen, limit: int | None) -> list[str]:
-    """Ends that are terminations and come after the same number of steps."""
+    """Terminations that recur after the same number of steps."""
     longest = max((end.length for end in seen.ends), default=0)
     lengths = Counter(end.length for end in seen.ends if end.terminated)
     n, at_end = lengths[longest], [end for end in seen.ends if end.length == longest]
@@ -139,20 +139,23 @@ def _looks_like_a_limit(seen: Seen, limit: int | None) -> list[str]:
         return []
     return [
         f"{n} of {counted(len(seen.ends), 'episode')} ended as terminations after exactly "
-        f"{longest} steps. That looks like a time limit: the learner will take states that are "
-        "worth something for worth nothing. Return truncated=True, terminated=False there, or use "
-        f"sb3_hds.wrappers.InfiniteHorizon(env, max_episode_steps={longest}). If the task really "
-        "is over then, let observations tell the time: sb3_hds.wrappers.TimeAware."
+        f"{longest} steps. That looks like a time limit: the learner will use 0 as the "
+        "value of states that have another. Return truncated=True, terminated=False there, or use "
+        f"sb3_hds.wrappers.InfiniteHorizon(env, max_episode_steps={longest}). If the task "
+        "really ends then, add the time to observations: sb3_hds.wrappers.TimeAware."
     ]
 
 
 def _never_acts(stacks: list[list[Limit]], env: Any, seen: Seen) -> list[str]:
-    """A limit around a shorter one, which ends every episode before."""
+    """A limit around a shorter one, which ends every episode first."""
     found = [pair for stack in stacks if (pair := _outrun(stack)) is not None]
     if found:
         outer, inner = found[0]
         where = f" (in {len(found)} of {len(stacks)} copies)" if len(stacks) > 1 else ""
-        what = f"The limit of {outer} never acts{where}: that of {inner} inside it comes first."
+        what = (
+            f"The limit of {outer} never takes effect{where}: "
+            f"that of {inner} inside it comes first."
+        )
     else:
         outer = min((stack[0] for stack in stacks if stack), key=_steps_of, default=None)
         cut = Counter(end.length for end in seen.ends if not end.terminated)
@@ -161,14 +164,14 @@ def _never_acts(stacks: list[list[Limit]], env: Any, seen: Seen) -> list[str]:
         if outer is None or longest >= outer.steps or n < _FEWEST or 2 * n < cut.total():
             return []
         what = (
-            f"{n} of {counted(len(seen.ends), 'episode')} were cut after exactly {longest} steps, "
-            f"by something inside: the limit of {outer} never acts."
+            f"{n} of {counted(len(seen.ends), 'episode')} were truncated after exactly {longest} "
+            f"steps by an inner layer: the limit of {outer} never takes effect."
         )
     spec = getattr(env, "spec", None)
     made = f"gymnasium.make('{spec.id}'" if spec is not None else "gymnasium.make(id"
     return [
-        f"{what} Episodes are shorter than was asked for. Set the limit where the environment is "
-        f"made, as {made}, max_episode_steps={outer.steps}), or leave one of them out."
+        f"{what} Episodes are shorter than requested. Set the limit where the environment is "
+        f"made, as {made}, max_episode_steps={outer.steps}), or remove one of them."
     ]
 
 
@@ -186,14 +189,14 @@ def _steps_of(limit: Limit) -> int:
 
 
 def _stands_out(lengths: Counter, longest: int) -> bool:
-    """Whether far more episodes ended at the longest length than failures alone would have it."""
+    """Whether far more episodes have the longest length than failures alone would explain."""
     n, earlier = lengths[longest], {k: m for k, m in lengths.items() if k < longest}
     before = max((m for k, m in earlier.items() if k >= 0.8 * longest), default=0)
     return n >= max(_THAN_BEFORE * before, _THAN_ANY * max(earlier.values(), default=0))
 
 
-def _tells_time_outs(seen: Seen) -> bool:
-    """Whether each end, or at least each time-out, is marked; SB3 reads a missing key as False."""
+def _marks_time_outs(seen: Seen) -> bool:
+    """Whether all ends, or at least the time-outs, are marked; SB3 reads a missing key as False."""
     flags = [end.info.get("TimeLimit.truncated") for end in seen.ends]
     return any(flags) or None not in flags
 
@@ -201,33 +204,35 @@ def _tells_time_outs(seen: Seen) -> bool:
 def _missing_keys(seen: Seen) -> list[str]:
     problems = []
     n = sum("TimeLimit.truncated" not in end.info for end in seen.ends)
-    if n and not _tells_time_outs(seen):
+    if n and not _marks_time_outs(seen):
         problems.append(
             f"In {n} of {counted(len(seen.ends), 'end')}, infos[i] had no 'TimeLimit.truncated'. "
-            "SB3 takes such an end for a termination, time-outs included. The VecEnv must set it "
+            "SB3 treats such an end as a termination, time-outs included. The VecEnv must set it "
             "in every step to `truncated and not terminated`."
         )
     n = sum(end.last_obs is None for end in seen.ends)
     if n:
         problems.append(
             f"In {n} of {counted(len(seen.ends), 'end')}, infos[i] had no 'terminal_observation'. "
-            "SB3 then stores the first observation of the next episode as where the step led. The "
-            "VecEnv must put the last observation there when it resets a copy by itself."
+            "SB3 then stores the first observation of the next episode as the next observation. "
+            "The VecEnv must put the last observation there when it resets a copy."
         )
     return problems
 
 
 def _lost_observations(env: VecEnv, seen: Seen) -> list[str]:
-    """Last observations that cannot be what they should be."""
+    """Reported last observations that are implausible."""
     reported = [end for end in seen.ends if end.last_obs is not None]
     strange = [end for end in reported if not _fits(env, end.last_obs)]
     if strange:
+        last = strange[0].last_obs
+        found = type(last).__name__ if isinstance(last, dict) else f"of shape {np.shape(last)}"
         return [
             f"In {len(strange)} of {counted(len(reported), 'end')}, "
-            f"infos[i]['terminal_observation'] was {_shape(strange[0].last_obs)} instead of one "
+            f"infos[i]['terminal_observation'] was {found} instead of one "
             f"observation of {env.observation_space}. Put the row of that copy there."
         ]
-    # Where all episodes begin alike, an episode may as well end where it began.
+    # If all episodes begin alike, an episode may also end where it began.
     starts_differ = any(not is_same(end.first_obs, reported[0].first_obs) for end in reported)
     n = sum(is_same(end.last_obs, end.first_obs) for end in reported)
     if not starts_differ or n < len(reported):
@@ -244,8 +249,8 @@ def _nothing_ended(seen: Seen) -> list[str]:
     if seen.ends:
         return []
     return [
-        f"No episode ended in {seen.n_steps} steps, so it is not known how a time-out arrives. "
-        "Pass more n_steps=; or, if nothing ever ends it, cut episodes: "
+        f"No episode ended in {seen.n_steps} steps, so it is not known how time-outs are reported. "
+        "Pass a larger n_steps=; or, if nothing ever ends an episode, add a limit: "
         "gymnasium.wrappers.TimeLimit(env, max_episode_steps=...)."
     ]
 
@@ -259,23 +264,23 @@ def _unseen(seen: Seen, limit: int | None) -> list[str]:
         when = f" before the limit of {limit} steps" if limit else ""
     return [
         f"No time-out was seen: all {counted(len(seen.ends), 'episode')} terminated{when}. How one "
-        "arrives has not been checked."
+        "is reported was not checked."
     ]
 
 
 def _stacks(env: VecEnv) -> tuple[list[list[Limit]], list[gymnasium.Env]]:
-    """:return: of each copy, the limits around it, outermost first; and copies in this process"""
+    """:return: the limits around each copy, outermost first; and the copies in this process"""
     bare, around = _unwrapped(env, VecEnvWrapper, "venv")
     if isinstance(bare, GymnasiumVecEnv):
         bare, more = _unwrapped(bare.env, VectorWrapper, "env")
         around += more
     if isinstance(bare, DummyVecEnv | SyncVectorEnv):
         return [around + limits_of(copy) for copy in bare.envs], list(bare.envs)
-    return [around + (own_limit(bare, *_NAMES) or _asked(bare))], []
+    return [around + (own_limit(bare, *_NAMES) or _limit_of_copies(bare))], []
 
 
 def _unwrapped(env: Any, wrapper: type, inner: str) -> tuple[Any, list[Limit]]:
-    """:return: what the wrappers of a kind are around, and their limits"""
+    """:return: what is inside all wrappers of this class, and their limits"""
     limits = []
     while isinstance(env, wrapper):
         limits += own_limit(env, *_NAMES)
@@ -283,11 +288,11 @@ def _unwrapped(env: Any, wrapper: type, inner: str) -> tuple[Any, list[Limit]]:
     return env, limits
 
 
-def _asked(env: Any) -> list[Limit]:
-    """What copies in processes of their own say, of which the outermost wrapper answers first."""
+def _limit_of_copies(env: Any) -> list[Limit]:
+    """The limit of copies in other processes, where the outermost wrapper answers first."""
     try:
         if isinstance(env, AsyncVectorEnv):
-            # Asked for what they do not have, they end.
+            # Asking for a missing attribute would end their processes.
             has_some = all(env.call("has_wrapper_attr", _NAMES[0]))
         else:
             has_some = env.has_attr(_NAMES[0])
@@ -304,14 +309,9 @@ def _fits(env: VecEnv, obs: Any) -> bool:
     return np.shape(obs) == (space.shape or ())
 
 
-def _shape(obs: Any) -> str:
-    return type(obs).__name__ if isinstance(obs, dict) else f"of shape {np.shape(obs)}"
-
-
 def _subject(env: Any, seen: Seen) -> str:
-    ends: list[End] = seen.ends
-    n_cut = sum(not end.terminated for end in ends)
+    n_cut = sum(not end.terminated for end in seen.ends)
     return (
         f"Truncation of {name_of(env)}: in {counted(seen.n_steps, 'step')}, {n_cut} truncated and "
-        f"{counted(len(ends) - n_cut, 'terminated episode')}"
+        f"{counted(len(seen.ends) - n_cut, 'terminated episode')}"
     )

@@ -13,38 +13,38 @@ from sb3_hds.errors import ParameterError, SafetyError
 from sb3_hds.wrappers.action_layer import ActionLayer, TransformLayer
 from sb3_hds.wrappers.interval import interval_of
 
-# What single precision takes away from two positions and a speed, as a share of the largest limit.
+# Rounding error of two positions and a speed in single precision, relative to the largest limit.
 _ROUNDING = 1e-6
 _ON_BREACH = ("raise", "warn", "ignore")
 
 
 class JointLimitBarrier(TransformLayer):
     r"""
-    The speed towards a joint's limit is bounded by the distance to it, as in
+    Bounds the speed towards a joint limit by the distance to it, as
     :class:`~sb3_hds.core.Barrier`:
 
     .. math:: u \le \frac{\gamma\,(q_\text{max} - q) - \varepsilon}{\Delta t}
 
-    Assumes joints that are commanded by their speed and miss no step by more than ``tolerance``,
-    that speed limits allow standing still, and an episode that begins within the limits. What can
-    be checked at construction is checked there; the rest is checked at every reset and step. It has
-    to be next to the environment: any layer below would change what it decided.
+    Assumes velocity-controlled joints with a tracking error of at most ``tolerance`` per step,
+    speed limits that allow standing still, and episodes that begin within the limits. These
+    assumptions are checked at construction where possible, otherwise at every reset and step. The
+    barrier must be next to the environment: a layer below it would change its commands.
 
-    ``info["constraint_cost"]`` is how far joints are beyond their limits, and
-    ``info["tracking_error"]`` by how much they missed their commands.
+    ``info["constraint_cost"]`` is the distance of joints beyond their limits, and
+    ``info["tracking_error"]`` that from their commanded positions.
 
-    :param env: observes the positions in a Box with one axis
+    :param env: its observations are a Box with one axis that contains the positions
     :param low: lower limit [rad] or [m], one number or one per guarded joint
     :param high: upper limit
-    :param position: where the observation has each joint's position: an index, or for an angle the
-        two indices of its cosine and sine
-    :param action: index of the command that is each joint's speed; default: 0, 1, ...
+    :param position: index of each joint's position in the observation, or for an angle the two
+        indices of its cosine and sine
+    :param action: index of each joint's speed command; default: 0, 1, ...
     :param gain: speed per unit of the command [rad/s] or [m/s]
     :param share: :math:`\gamma`, above 0 and at most 1: the largest share of the distance per step
-    :param tolerance: :math:`\varepsilon`, by how much a step may miss [rad] or [m]; default: what
-        single precision needs
+    :param tolerance: :math:`\varepsilon`, tracking error per step [rad] or [m]; default: the
+        rounding error of single precision
     :param dt: control interval [s]; default: the environment's own ``dt`` or ``tau``
-    :param on_breach: what to do where an assumption does not hold: ``"raise"``, ``"warn"`` or
+    :param on_breach: what to do if an assumption is violated: ``"raise"``, ``"warn"`` or
         ``"ignore"``
     :param store: ``"executed"``: learners store the bounded command
     :raises ParameterError: for numbers out of range, or another layer below
@@ -75,7 +75,6 @@ class JointLimitBarrier(TransformLayer):
             "tolerance": tolerance,
             "dt": dt,
             "on_breach": on_breach,
-            "store": store,
         }
         refuse_layers_below(type(self), env)
         self._on_breach = check_on_breach(type(self), on_breach)
@@ -93,39 +92,38 @@ class JointLimitBarrier(TransformLayer):
             tolerance=_number("tolerance", tolerance),
             dt=interval_of(env, ParameterError) if dt is None else float(dt),
         )
-        super().__init__(env, self._barrier, store, arguments)
+        super().__init__(env, self._barrier, store, **arguments)
         self._turns = np.array([not isinstance(place, int) for place in self._barrier.position])
-        self._missed = 0.0
+        self._tracking_error = 0.0
 
     def begin(self, obs: Any) -> None:
         super().begin(obs)
-        self._missed = 0.0
+        self._tracking_error = 0.0
         if not self.cost() <= self._barrier.tolerance:
             self._breach(
                 f"An episode begins {self.cost():.3g} beyond the joint limits, at "
                 f"{self._barrier.positions(self._obs)}. Start within them."
             )
 
-    def arrive(self, obs: Any, command: np.ndarray) -> None:
+    def observe(self, obs: Any, command: np.ndarray) -> None:
         barrier, before = self._barrier, self._barrier.positions(self._obs)
-        super().arrive(obs, command)
+        super().observe(obs, command)
         speed = barrier.gain * command[list(barrier.action)].astype(float)
         error = barrier.positions(self._obs) - before - speed * barrier.dt
         turned = (error + math.pi) % (2.0 * math.pi) - math.pi
-        self._missed = float(np.max(np.abs(np.where(self._turns, turned, error))))
-        if not self._missed <= barrier.tolerance:
+        self._tracking_error = float(np.max(np.abs(np.where(self._turns, turned, error))))
+        if not self._tracking_error <= barrier.tolerance:
             self._breach(
-                f"A joint missed what its speed command asks for by {self._missed:.3g}, and the "
-                f"barrier counts on at most {barrier.tolerance:.3g}. It protects joints that are "
-                "commanded by their speed: check gain, dt, position and action, or pass the "
-                "tolerance of the drive."
+                f"A joint missed its commanded position by {self._tracking_error:.3g}, and the "
+                f"barrier assumes at most {barrier.tolerance:.3g}. It protects velocity-controlled "
+                "joints: check gain, dt, position and action, or pass the tolerance of the drive."
             )
 
     def cost(self) -> float:
         return float(self._barrier.violation(self._obs))
 
     def extra_info(self) -> dict[str, Any]:
-        return {"tracking_error": self._missed}
+        return {"tracking_error": self._tracking_error}
 
     def _breach(self, message: str) -> None:
         report_breach(self._on_breach, message)
@@ -133,8 +131,8 @@ class JointLimitBarrier(TransformLayer):
 
 def _count(position: Any) -> int:
     """
-    :return: how many joints are guarded
-    :raises ParameterError: unless each has an index, or those of its cosine and sine
+    :return: number of guarded joints
+    :raises ParameterError: unless each has an index, or the indices of its cosine and sine
     """
     places = position if isinstance(position, Sequence) and not isinstance(position, str) else []
     if not places or not all(isinstance(p, int) or _is_pair(p) for p in places):
@@ -172,7 +170,7 @@ def _number(name: str, value: Any) -> float:
 
 
 def report_breach(on_breach: str, message: str) -> None:
-    """:raises SafetyError: with the message, if it is to be raised"""
+    """:raises SafetyError: with the message, if ``on_breach`` is ``"raise"``"""
     if on_breach == "raise":
         raise SafetyError(message)
     if on_breach == "warn":
@@ -189,12 +187,12 @@ def check_on_breach(layer: type, on_breach: str) -> str:
 
 
 def refuse_layers_below(layer: type, env: gymnasium.Env) -> None:
-    """:raises ParameterError: if a layer below would change what a safety layer decides"""
+    """:raises ParameterError: if a layer below would change the commands of a safety layer"""
     below = env
     while isinstance(below, gymnasium.Wrapper):
         if isinstance(below, ActionLayer) and below.alters_commands:
             raise ParameterError(
                 f"{layer.__name__} must have the last word, but {type(below).__name__} below it "
-                "changes commands. Wrap the other way round: the safety layer first."
+                "changes commands. Swap the two: wrap with the safety layer first."
             )
         below = below.env

@@ -1,7 +1,9 @@
 """Shared control templates: a task in phases, each with few inputs and its own constraints."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium
@@ -10,10 +12,11 @@ from gymnasium import spaces
 
 from sb3_hds.core import Channel
 from sb3_hds.errors import ParameterError, SafetyError
-from sb3_hds.wrappers.action_layer import ActionLayer, is_vector, with_channels
+from sb3_hds.wrappers.action_layer import ActionLayer, with_channels
 from sb3_hds.wrappers.by_name import function_of
+from sb3_hds.wrappers.observations import is_vector
 from sb3_hds.wrappers.safety.barrier import refuse_layers_below
-from sb3_hds.wrappers.safety.projection import Constraints, ConstraintSet, condition_of, nearest
+from sb3_hds.wrappers.safety.shield import Constraints, ConstraintSet, nearest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,11 +27,11 @@ class Phase:
     :param name: unique within the template
     :param mapping: from inputs to commands, a matrix of shape ``(n_commands, n_inputs)``; or a
         function of the observation that returns one, or its name ``"package.module.function"``
-    :param offset: command for inputs of zero, shape ``(n_commands,)``; default: zero
-    :param constraints: active in this phase, as :class:`ActionShield` takes them; None: none
-    :param transitions: ``{"to": NAME, "when": CONDITION}``, the first that holds after a step
-        counts. A condition is a function of the observation, its name, or ``{"channel": INDEX,
-        "above": VALUE}`` (or ``"below"``)
+    :param offset: command at zero input, shape ``(n_commands,)``; default: zero
+    :param constraints: of this phase, as for :class:`ActionShield`; None: none
+    :param transitions: ``{"to": NAME, "when": CONDITION}``; the first whose condition holds after a
+        step is taken. A condition is a function of the observation, its name, or ``{"channel":
+        INDEX, "above": VALUE}`` (or ``"below"``)
     """
 
     name: str
@@ -40,24 +43,23 @@ class Phase:
 
 class SharedControlTemplate(ActionLayer):
     r"""
-    A finite-state description of a task. In each phase, a few inputs in [-1, 1] are mapped to
-    commands, :math:`u = M(o)\,a + c`, and projected onto the constraints of the phase; conditions
-    on observations lead from phase to phase. The policy learns only the remaining inputs,
-    and constraints are enforced rather than rewarded.
+    A state machine of a task. In each phase, a few inputs in [-1, 1] are mapped to commands,
+    :math:`u = M(o)\,a + c`, and projected onto the constraints of the phase; conditions on
+    observations lead from phase to phase. The policy learns the inputs only, and constraints are
+    enforced rather than rewarded.
 
-    The phase is appended to observations, one entry for each, 1 for the present one.
-    ``info["phase"]`` is its name. Learners store the raw action, because a command has no unique
-    input.
+    The phase is appended to observations, one-hot. ``info["phase"]`` is its name. Learners store
+    the raw action, because a command has no unique input.
 
-    Assumes that some command is allowed at every observation of a phase. It has to be next to the
-    environment: any layer below would change what it decided.
+    Assumes that some command is allowed at every observation of a phase. The template must be next
+    to the environment: a layer below it would change its commands.
 
     Source: the idea of shared control templates as in Quere et al., *Shared control templates for
     assistive robotics*, ICRA 2020, and Padalkar et al., *Guiding reinforcement learning with shared
-    control templates*, ICRA 2023; this is a description of its own, for linear constraints.
+    control templates*, ICRA 2023; the formulation here, with linear constraints, is our own.
 
-    :param env: observes a Box with one axis, takes a bounded one
-    :param phases: the first is where an episode begins; a :class:`Phase` each, or its arguments
+    :param env: its observations are a Box with one axis, its actions a bounded one
+    :param phases: :class:`Phase` each, or its arguments; an episode begins in the first
     :param observe_state: whether the phase is appended; without it, the task is not Markov
     :param store: ``"raw"``
     :raises ParameterError: for phases that do not fit each other or the environment
@@ -73,23 +75,20 @@ class SharedControlTemplate(ActionLayer):
         observe_state: bool = True,
         store: str = "raw",
     ) -> None:
-        arguments = {"phases": phases, "observe_state": observe_state, "store": store}
         refuse_layers_below(type(self), env)
-        super().__init__(env, store, arguments)
+        super().__init__(env, store, phases=phases, observe_state=observe_state)
         self.phases = [_phase_of(phase) for phase in phases]
         self._observes, self._index, self._seen = observe_state, 0, None
         self._violated = 0.0
         self._phase_of = {phase.name: i for i, phase in enumerate(self.phases)}
         if len(self._phase_of) != len(self.phases) or not self.phases:
-            raise ParameterError(
-                f"Phases need names of their own: {[p.name for p in self.phases]}."
-            )
-        self._parts = [_Compiled(phase, env, self._phase_of) for phase in self.phases]
-        n_inputs = {part.n_inputs for part in self._parts if part.n_inputs is not None}
+            raise ParameterError(f"Phases need unique names: {[p.name for p in self.phases]}.")
+        self._compiled = [_Compiled(phase, env, self._phase_of) for phase in self.phases]
+        n_inputs = {phase.n_inputs for phase in self._compiled if phase.n_inputs is not None}
         if len(n_inputs) != 1:
             raise ParameterError(
-                f"All phases must map the same number of inputs, got {sorted(n_inputs)}: fill "
-                "mappings up with columns of zeros, and give one phase at least a constant one."
+                f"All phases must map the same number of inputs, got {sorted(n_inputs)}: pad "
+                "mappings with columns of zeros, and give at least one phase a constant mapping."
             )
         self.action_space = spaces.Box(-1.0, 1.0, (n_inputs.pop(),), np.float32)
         if observe_state:
@@ -98,20 +97,20 @@ class SharedControlTemplate(ActionLayer):
 
     @property
     def phase(self) -> str:
-        """Name of the present phase."""
+        """Name of the current phase."""
         return self.phases[self._index].name
 
     def nominal(self, action: np.ndarray) -> np.ndarray:
-        part = self._parts[self._index]
-        command = part.matrix(self._seen) @ np.clip(action, -1.0, 1.0) + part.offset
+        phase = self._compiled[self._index]
+        command = phase.matrix(self._seen) @ np.clip(action, -1.0, 1.0) + phase.offset
         return np.clip(command, self.commands.low, self.commands.high)
 
     def decide(self, action: np.ndarray) -> np.ndarray:
-        wanted, part = self.nominal(action), self._parts[self._index]
-        if part.constraints is None:
+        wanted, phase = self.nominal(action), self._compiled[self._index]
+        if phase.constraints is None:
             return wanted
         ends = self.commands.low.astype(float), self.commands.high.astype(float)
-        command = nearest(wanted, *part.constraints.at(self._seen), *ends)
+        command = nearest(wanted, *phase.constraints.at(self._seen), *ends)
         if command is None:
             raise SafetyError(
                 f"No command satisfies the constraints of phase '{self.phase}' at the observation "
@@ -122,17 +121,17 @@ class SharedControlTemplate(ActionLayer):
     def begin(self, obs: Any) -> None:
         super().begin(obs)
         self._index, self._violated = 0, 0.0
-        self._move_on(obs)
+        self._transition(obs)
 
-    def arrive(self, obs: Any, command: np.ndarray) -> None:
-        super().arrive(obs, command)
-        constraints, self._violated = self._parts[self._index].constraints, 0.0
+    def observe(self, obs: Any, command: np.ndarray) -> None:
+        super().observe(obs, command)
+        constraints, self._violated = self._compiled[self._index].constraints, 0.0
         if constraints is not None:
             G, h = constraints.at(self._seen)
             self._violated = float(np.clip(G @ command - h, 0.0, None).sum())
-        self._move_on(obs)
+        self._transition(obs)
 
-    def seen(self, obs: Any) -> Any:
+    def observation(self, obs: Any) -> Any:
         if not self._observes:
             return obs
         flags = np.arange(len(self.phases)) == self._index
@@ -144,9 +143,9 @@ class SharedControlTemplate(ActionLayer):
     def extra_info(self) -> dict[str, Any]:
         return {"phase": self.phase}
 
-    def _move_on(self, obs: Any) -> None:
+    def _transition(self, obs: Any) -> None:
         self._seen = obs
-        for condition, following in self._parts[self._index].transitions:
+        for condition, following in self._compiled[self._index].transitions:
             if condition(obs):
                 self._index = following
                 return
@@ -167,7 +166,7 @@ def _phase_of(given: Any) -> Phase:
 
 
 class _Compiled:
-    """A phase whose names have become functions and indices."""
+    """A phase with its names resolved to functions and indices."""
 
     def __init__(self, phase: Phase, env: gymnasium.Env, phases: Mapping[str, int]) -> None:
         assert env.action_space.shape is not None
@@ -187,9 +186,9 @@ class _Compiled:
         if phase.constraints is not None:
             label = f"Phase '{phase.name}'"
             self.constraints = ConstraintSet(label, phase.constraints, self._n)
-            self._refuse_what_nothing_satisfies(env.action_space)
+            self._check_feasible(env.action_space)
         seen = env.observation_space
-        n_obs = seen.shape[0] if isinstance(seen, spaces.Box) and is_vector(seen) else 0
+        n_obs = seen.shape[0] if is_vector(seen) else 0
         for transition in phase.transitions:
             if not isinstance(transition, Mapping) or set(transition) != {"to", "when"}:
                 raise ParameterError(
@@ -202,10 +201,10 @@ class _Compiled:
                 f"Phase '{phase.name}' leads to {unknown}, but there are: {list(phases)}."
             )
         self.transitions = [
-            (condition_of(t["when"], n_obs), phases[t["to"]]) for t in phase.transitions
+            (_condition_of(t["when"], n_obs), phases[t["to"]]) for t in phase.transitions
         ]
 
-    def _refuse_what_nothing_satisfies(self, commands: spaces.Space) -> None:
+    def _check_feasible(self, commands: spaces.Space) -> None:
         assert isinstance(commands, spaces.Box) and self.constraints is not None
         if not self.constraints.is_constant:
             return
@@ -231,3 +230,27 @@ class _Compiled:
                 f"{matrix!r}."
             )
         return found
+
+
+def _condition_of(given: Any, n_obs: int) -> Callable[[Any], Any]:
+    """
+    :param given: a function of the observation, its name, or ``{"channel": 0, "above": 0.5}`` with
+        ``above``, ``below`` or both
+    :raises ParameterError: for anything else
+    """
+    if isinstance(given, str):
+        return function_of(given)
+    if not isinstance(given, Mapping) and callable(given):
+        return given
+    known = isinstance(given, Mapping) and {"channel"} < set(given) <= {"channel", "above", "below"}
+    if not known or given["channel"] not in range(n_obs):
+        raise ParameterError(
+            "A condition is a function of the observation, its name, or {'channel': INDEX, "
+            f"'above': VALUE}} (or 'below') with an index below {n_obs}; got {given!r}."
+        )
+    low, high = float(given.get("above", -math.inf)), float(given.get("below", math.inf))
+    return functools.partial(_is_between, channel=given["channel"], low=low, high=high)
+
+
+def _is_between(obs: Any, channel: int, low: float, high: float) -> bool:
+    return bool(low < obs[channel] < high)

@@ -11,26 +11,27 @@ from gymnasium import spaces
 from sb3_hds.data.recording import Recorder
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.wrappers.interval import interval_of
+from sb3_hds.wrappers.observations import is_vector
 
 
 class Record(gymnasium.Wrapper):
     """
     Writes every reset and step to a file that ``Trajectories.load(path)`` reads.
 
-    Each step is on its way to the disk when ``step`` returns: what was recorded before the process
-    is killed is readable. Observations, actions and rewards are left alone. Put it directly around
-    the environment, inside wrappers that scale. A loop without an environment uses
+    Each step is handed to the operating system before ``step`` returns, so a recording stays
+    readable if the process is killed. Observations, actions and rewards are unchanged. Wrap the
+    environment directly, inside of wrappers that scale. For a loop without an environment, use
     :class:`sb3_hds.data.Recorder`.
 
-    :param env: its observations are arrays of one axis, its actions too, or numbers
-    :param path: ``.jsonl`` is appended where it is missing; an existing file is never overwritten
+    :param env: its observations are a Box with one axis, its actions too, or Discrete
+    :param path: ``.jsonl`` is appended if missing; an existing file is never overwritten
     :param dt: control interval [s]; default: the environment's own ``dt`` or ``tau``
     :param obs_names: of the observation channels; default: ``obs[0]``, ``obs[1]``, ...
     :param action_names: of the action channels; default: ``action[0]``, ...
-    :param condition: label of what was different: a load, a gain; ``recorder.condition`` changes
-        it for the episodes to come
-    :param clock: returns the time [s], as ``time.monotonic``, for a robot whose steps vary
-    :param append: continue an existing file
+    :param condition: label of the test condition, such as a load or a gain; set
+        ``recorder.condition`` to change it for later episodes
+    :param clock: returns the time [s], such as ``time.monotonic``, for steps of varying length
+    :param append: whether to continue an existing file
     :raises TrajectoryError: for other spaces, an unknown interval, or a file that exists
     """
 
@@ -78,7 +79,7 @@ class Record(gymnasium.Wrapper):
 
 def _names(kind: str, space: spaces.Space, names: Sequence[str] | None) -> Sequence[str]:
     single = isinstance(space, spaces.Discrete) and kind == "action"
-    if not single and not (isinstance(space, spaces.Box) and len(space.shape) == 1):
+    if not single and not is_vector(space):
         raise TrajectoryError(
             f"Record takes observations and actions that are boxes of one axis, got the {kind} "
             f"space {space}. Flatten it first: gymnasium.wrappers.FlattenObservation."

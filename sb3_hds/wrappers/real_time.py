@@ -11,21 +11,21 @@ import numpy as np
 
 from sb3_hds.errors import ParameterError, SafetyError
 
-# The histogram of latencies has this many bins per period, over this many periods.
+# Bins per period of the histogram of latencies, and its range in periods.
 _BINS, _PERIODS = 20, 2
-# The least time between two looks of a watchdog that has nothing to do, as a share of the period.
-_LEAST_PAUSE = 0.1
+# Minimum polling interval of an idle watchdog, as a share of the period.
+_MIN_PAUSE = 0.1
 
 
 class Timing(NamedTuple):
     """
     Counters since the environment was wrapped.
 
-    :param steps: commands of the learner that were executed
-    :param overruns: of them, those that came after their deadline
-    :param safe_actions: commands of the watchdog
+    :param steps: executed commands of the learner
+    :param overruns: those of them that missed their deadline
+    :param safe_actions: executed commands of the watchdog
     :param slow_steps: steps of the environment, of either kind, that took longer than a period
-    :param dropped: commands that came after the episode had ended under the watchdog
+    :param dropped: commands that arrived after the watchdog had reached the end of the episode
     """
 
     steps: int = 0
@@ -38,37 +38,37 @@ class Timing(NamedTuple):
 class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     r"""
     One command per period :math:`T`, at the ticks of a monotonic clock. ``step`` waits for the next
-    tick, executes the command and returns what is then observed; the learner has until the
-    following tick to answer.
+    tick, executes the command and returns the resulting observation; the learner has until the
+    following tick to respond.
 
-    A command that comes after its tick is an overrun: it is executed at once. With a
-    ``safe_action``, a watchdog executes that one if no command has come ``grace`` after a tick, and
-    again at each tick until one comes. Then the reward of ``step`` includes the missed steps, and
-    ``info["missed_steps"]`` is how many safe actions were executed since the last observation that
-    the learner saw. An episode that ends meanwhile is reported by the next ``step``, whose command
-    is dropped (``info["command_dropped"]``).
+    A command that arrives after its tick is an overrun, and is executed at once. With a
+    ``safe_action``, a watchdog executes that action if no command has arrived ``grace`` after a
+    tick, and again at each tick until one arrives. The reward of the next ``step`` then includes
+    the missed steps, and ``info["missed_steps"]`` is the number of safe actions since the last
+    observation that the learner received. If the episode ends meanwhile, the next ``step`` reports
+    it and drops its command (``info["command_dropped"]``).
 
-    The first command after a reset begins the ticks, so none passes between the end of an episode
-    and that command: train there (``train_freq=(1, "episode")``; vectorised environments reset
-    first), or beside the loop with :class:`sb3_hds.algos.TrainBeside`. Where ``step`` is
-    interrupted or raises, the watchdog goes on with the safe action until ``reset`` or ``close``.
+    Ticks start with the first command after a reset, so no deadline passes between the end of an
+    episode and that command: train there (``train_freq=(1, "episode")``; vectorised environments
+    reset first), or in parallel with :class:`sb3_hds.algos.TrainBeside`. If ``step`` is interrupted
+    or raises, the watchdog continues with the safe action until ``reset`` or ``close``.
 
-    A general-purpose operating system wakes a process late, on a busy machine by milliseconds: this
-    is not hard real time, and no substitute for a watchdog in the drive.
+    This is not hard real time, and no substitute for a watchdog in the drive: a general-purpose
+    operating system may wake a process milliseconds late.
 
-    Times are no part of ``info``, which is a function of seed and actions: they are attributes,
-    ``timing``, ``latency`` (of the latest command, from observation to command [s]; 0 for the first
-    of an episode, which is on time whenever it comes), ``overrun`` (whether that came late) and
+    Times are not in ``info``, which is a function of seed and actions, but in attributes:
+    ``timing``, ``latency`` (from observation to the latest command [s]; 0 for the first of an
+    episode, which is never late), ``overrun`` (whether that command was late) and
     :meth:`latencies`.
 
-    :param env: of any kind; simulated ones wait for the clock, real ones must return promptly
+    :param env: of any kind; ``step`` of a real one must return promptly
     :param period: :math:`T` [s]
-    :param safe_action: what the watchdog executes; None: there is no watchdog
-    :param grace: how late a command may be before the watchdog acts, as a share of the period
-    :param threaded: whether the watchdog has a thread of its own; without, call :meth:`watch`
+    :param safe_action: command of the watchdog; None: no watchdog
+    :param grace: delay after a tick at which the watchdog acts, as a share of the period
+    :param threaded: whether the watchdog runs in its own thread; otherwise, call :meth:`watch`
     :param clock: monotonic [s]
-    :param sleep: waits for so many seconds
-    :raises ParameterError: for a period or a grace out of range, or an action out of the space
+    :param sleep: waits for a time [s]
+    :raises ParameterError: for a period or a grace out of range, or an action outside the space
     """
 
     def __init__(
@@ -96,10 +96,10 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self._clock, self._sleep = clock, sleep
         self.timing, self.latency, self.overrun = Timing(), 0.0, False
         self._counts = np.zeros(_BINS * _PERIODS + 1, int)
-        self._deadline, self._answered = 0.0, 0.0
+        self._deadline, self._observed_at = 0.0, 0.0
         self._begun, self._running, self._claimed = False, False, False
         self._missed: list[tuple[Any, Any, bool, bool, dict[str, Any]]] = []
-        self._begin_watching()
+        self._init_watchdog()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -112,20 +112,20 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """
         :return: as the environment; see above for rewards and ``info``
-        :raises SafetyError: if the environment failed under the watchdog since the last step
+        :raises SafetyError: if the watchdog could not step the environment since the last step
         """
-        came = self._clock()
+        arrival = self._clock()
         if self._failure is not None:
             raise SafetyError(
-                "The watchdog could not execute the safe action; nothing was executed since. Stop "
-                "the robot by hand, then reset."
+                "The watchdog could not execute the safe action; nothing was executed since then. "
+                "Stop the robot by hand, then reset."
             ) from self._failure
         if self._begun:
-            self.latency = came - self._answered
-            self._note(self.latency)
+            self.latency = arrival - self._observed_at
+            self._count(self.latency)
             self.watch()
         else:
-            self._begin(came)
+            self._begin(arrival)
         with self._lock:
             missed, self._missed = self._missed, []
             if missed and (missed[-1][2] or missed[-1][3]):
@@ -133,13 +133,13 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
                 self.timing = self.timing._replace(dropped=self.timing.dropped + 1)
                 return self._merged(missed, dropped=True)
             self._claimed = True
-        self.overrun = bool(missed) or came > self._deadline
+        self.overrun = bool(missed) or arrival > self._deadline
         try:
             if (wait := self._deadline - self._clock()) > 0.0:
                 self._sleep(wait)
             with self._lock:
                 result = self._execute(action)
-                self._answered = self._clock()
+                self._observed_at = self._clock()
                 self.timing = self.timing._replace(
                     steps=self.timing.steps + 1,
                     overruns=self.timing.overruns + int(self.overrun),
@@ -156,13 +156,13 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         with self._lock:
             self._deadline, self.latency = now, 0.0
             self._begun, self._running = True, True
-        self._watch_on()
+        self._start_watchdog()
 
     def watch(self) -> bool:
         """
-        Execute the safe action if it is due: what the watchdog's thread does at each tick.
+        Execute the safe action if it is due, as the watchdog's thread does at each tick.
 
-        :return: whether it was
+        :return: whether it was due
         """
         with self._lock:
             due = self._deadline + self.grace * self.period
@@ -174,7 +174,7 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
 
     def latencies(self) -> tuple[np.ndarray, np.ndarray]:
         """
-        The histogram of times from observation to command.
+        Histogram of the times from observation to command.
 
         :return: counts, shape ``(n,)``, and edges [s], shape ``(n + 1,)``; the last bin is open
         """
@@ -189,13 +189,13 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         super().close()
 
     def _execute(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment, and set the next deadline on the grid of ticks."""
+        """Step the environment, and set the deadline to the next tick."""
         begin = self._clock()
         result = self.env.step(action)
         end = self._clock()
         if end - begin > self.period:
             self.timing = self.timing._replace(slow_steps=self.timing.slow_steps + 1)
-        if self._safe is None:  # nobody kept the ticks: begin a grid anew where one was missed
+        if self._safe is None:  # without a watchdog, restart the ticks after a missed one
             self._deadline = max(self._deadline, begin)
         passed = math.floor((end - self._deadline) / self.period + 1e-9)
         self._deadline += self.period * (1 + max(0, passed))
@@ -214,27 +214,27 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         }
         return obs, sum(float(result[1]) for result in results), terminated, truncated, info
 
-    def _note(self, latency: float) -> None:
+    def _count(self, latency: float) -> None:
         place = int(latency / self.period * _BINS)
         self._counts[min(max(place, 0), len(self._counts) - 1)] += 1
 
-    def _begin_watching(self) -> None:
+    def _init_watchdog(self) -> None:
         self._lock, self._stopped = threading.RLock(), threading.Event()
         self._failure: Exception | None = None
         self._thread: threading.Thread | None = None
 
-    def _watch_on(self) -> None:
+    def _start_watchdog(self) -> None:
         if self._threaded and self._thread is None:
             self._stopped.clear()
-            self._thread = threading.Thread(target=self._keep_watching, daemon=True)
+            self._thread = threading.Thread(target=self._run_watchdog, daemon=True)
             self._thread.start()
 
-    def _keep_watching(self) -> None:
+    def _run_watchdog(self) -> None:
         while not self._stopped.is_set():
             due = self._deadline + self.grace * self.period - self._clock()
             idle = not self._running or self._claimed
             if idle or due > 0.0:
-                pause = max(self.grace, _LEAST_PAUSE) * self.period
+                pause = max(self.grace, _MIN_PAUSE) * self.period
                 self._stopped.wait(pause if idle else due)
                 continue
             try:
@@ -247,7 +247,7 @@ class RealTime(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._begin_watching()
+        self._init_watchdog()
         self._begun, self._running = False, False
 
 

@@ -1,4 +1,4 @@
-"""A run's clock, and its checkpoints: what it goes on from when it is run again."""
+"""Callbacks: progress of a trial; clock and checkpoints of a run, from which it is resumed."""
 
 import shutil
 import time
@@ -10,19 +10,46 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from rl_zoo_plugin.trials import budget
+
 _MODEL, _BUFFER, _BEST = "model.zip", "replay_buffer.pkl", "best_model.zip"
-# Between two lines of the clock [s].
-_EVERY = 1.0
+# Between two lines of the clock, and of the progress of a trial [s].
+_CLOCK_INTERVAL, _PROGRESS_INTERVAL = 1.0, 10.0
 _EVALUATIONS, _STATISTICS = "evaluations.npz", "vecnormalize.pkl"
+
+
+class TrialProgress(BaseCallback):
+    """Prints the progress of a trial of ``rl_zoo3 train -optimize`` every ten seconds."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        now = budget()
+        self.name = "Trial" if now is None else f"Trial {now.trial}"
+        self._begin = self._printed = 0.0
+
+    def _on_training_start(self) -> None:
+        self._begin = time.monotonic()
+        self._print(f"0 of {self.locals['total_timesteps']} steps")
+
+    def _on_step(self) -> bool:
+        if time.monotonic() - self._printed > _PROGRESS_INTERVAL:
+            planning = self.locals.get("pretraining", False)
+            steps = f"{self.num_timesteps} of {self.locals['total_timesteps']} steps"
+            self._print("planning before the first step" if planning else steps)
+        return True
+
+    def _print(self, what: str) -> None:
+        self._printed = time.monotonic()
+        print(f"{self.name}: {what} after {self._printed - self._begin:.0f} s", flush=True)
 
 
 class Clock(BaseCallback):
     """
-    Writes how many steps were made by when, and ends the training when its time is up.
+    Writes the steps made so far against time, and ends the training when its time is up.
 
-    :param path: of a table to write, or to go on with: ``timesteps``, ``seconds`` since the
-        training began
-    :param minutes: that a training may take, evaluations included; None: any
+    :param path: of the table to write or continue: ``timesteps``, ``seconds`` since the training
+        began
+    :param minutes: limit of the training, evaluations included; None: no limit
     """
 
     def __init__(self, path: Path, minutes: float | None) -> None:
@@ -38,7 +65,7 @@ class Clock(BaseCallback):
 
     def _on_step(self) -> bool:
         now = time.monotonic()
-        if now - self._written >= _EVERY:
+        if now - self._written >= _CLOCK_INTERVAL:
             self.write()
         return self.limit is None or now - self._begin < self.limit
 
@@ -53,10 +80,10 @@ class Clock(BaseCallback):
 
 class Checkpoints(BaseCallback):
     """
-    Writes the model, its replay buffer and the logs so far, all or nothing.
+    Saves the model, its replay buffer and the logs so far, atomically.
 
-    :param folder: one checkpoint, the last
-    :param minutes: from one to the next
+    :param folder: of the latest checkpoint
+    :param minutes: between checkpoints
     :param logs: the zoo's folder of this run: evaluations, best model, episodes
     :param env_name: of the environment, in names of files
     :param clock: writes the table of steps and seconds
@@ -104,21 +131,21 @@ class Checkpoints(BaseCallback):
 def last_checkpoint(folder: Path) -> Path | None:
     """:return: the model of the last checkpoint; None where there is none"""
     old = folder.with_name(f"{folder.name}.old")
-    # It was stopped between two renames.
+    # The process was stopped between the two renames of a checkpoint.
     if not folder.exists() and old.exists():
         old.rename(folder)
     return folder / _MODEL if (folder / _MODEL).exists() else None
 
 
-def go_on(manager: Any, folder: Path) -> None:
+def restore_logs(manager: Any, folder: Path) -> None:
     """
-    Let evaluations and logs of a run go on where its checkpoint ends.
+    Continue the evaluations and logs of a run from its checkpoint.
 
     :param manager: the zoo's ``ExperimentManager``, with its callbacks
     """
     logs = Path(manager.save_path)
     for file in folder.glob(f"*{Monitor.EXT}"):
-        # Not the name of the file that the environment is writing.
+        # The original name is taken by the file that the environment is writing.
         shutil.copy(file, logs / f"before_{file.name}")
     for name in (_BEST, _EVALUATIONS):
         if (folder / name).exists():
@@ -135,9 +162,9 @@ def go_on(manager: Any, folder: Path) -> None:
             callback.best_mean_reward = float(returns.mean(1).max())
 
 
-class Continued:
+class ResumedModel:
     """
-    What the zoo trains instead of a model that was loaded: the steps that are left.
+    Stands in for a loaded model in the zoo, and trains it for the remaining steps only.
 
     :param model: from a checkpoint
     """
@@ -146,9 +173,11 @@ class Continued:
         self.model, self.env = model, model.env
 
     def learn(self, total_timesteps: int, **given: Any) -> Any:
-        """:param total_timesteps: of the whole run"""
+        """:param total_timesteps: of the run from its beginning"""
         done = self.model.num_timesteps
         for callback in given.get("callback", ()):
             callback.n_calls = done // self.model.n_envs
-        left = max(total_timesteps - done, 0)
-        return self.model.learn(left, reset_num_timesteps=False, **given) if left else self.model
+        remaining = max(total_timesteps - done, 0)
+        if not remaining:
+            return self.model
+        return self.model.learn(remaining, reset_num_timesteps=False, **given)

@@ -1,1 +1,0 @@
-"""Wrappers that set when an episode ends, and how the next one begins."""

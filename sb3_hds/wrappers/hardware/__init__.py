@@ -1,1 +1,0 @@
-"""Wrappers for a real machine: its clock, its log, and pushes."""

@@ -1,1 +1,0 @@
-"""Wrappers that add to what the policy observes."""
