@@ -1,9 +1,12 @@
-"""Run tasks on the machines of a Ray cluster."""
+"""Run tasks on this machine, or on the machines of a Ray cluster."""
 
+import contextlib
 import logging
 import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from sb3_hds.errors import StudyError
@@ -30,6 +33,38 @@ class Share(NamedTuple):
     cpus: float = 1.0
     gpus: float = 0.0
     memory: float = 2.0
+
+
+def on_this_machine(
+    work: Callable[[Input], Result],
+    given: Sequence[Input],
+    jobs: int | None = None,
+    memory: float = 2.0,
+) -> Iterator[tuple[Input, Result]]:
+    """
+    Run a function on each input, in threads: its work is that of processes that it starts.
+
+    :param work: the function
+    :param given: the inputs
+    :param jobs: tasks at a time; default: one per core
+    :param memory: of a task [GiB]; limits the tasks at a time to what fits into free memory
+    :return: inputs and results, as tasks end
+    """
+    wanted, free = jobs or os.cpu_count() or 1, _free_memory()
+    at_a_time = max(1, wanted if free is None else min(wanted, int(free / memory)))
+    with ThreadPoolExecutor(at_a_time) as pool:
+        waited = {pool.submit(work, one): one for one in given}
+        for future in as_completed(waited):
+            yield waited[future], future.result()
+
+
+def _free_memory() -> float | None:
+    """[GiB]; None if the system does not report it."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) / 2**20
+    return None
 
 
 def on_cluster(

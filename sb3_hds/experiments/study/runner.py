@@ -15,14 +15,13 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from sb3_hds.core.trajectories.storage import write_bytes
 from sb3_hds.errors import StudyError
-from sb3_hds.experiments.cluster import Share, on_cluster
+from sb3_hds.experiments.cluster import Share, on_cluster, on_this_machine
 from sb3_hds.experiments.study.definition import Command, Run, Study, zoo_command
 
 #: file that marks a complete run, with its settings
@@ -97,7 +96,7 @@ def run_study(
         complete = {run.place for run in study.runs} - {run.place for run in waiting}
         failed: list[tuple[Run, str]] = []
         ended = (
-            _on_this_machine(one, waiting, _at_a_time(jobs, memory))
+            on_this_machine(one, waiting, jobs, memory)
             if ray is None
             else on_cluster(one, waiting, ray, Share(cpus, gpus, memory), jobs)
         )
@@ -109,16 +108,6 @@ def run_study(
             what = "complete" if error is None else f"failed: {error[-_SHOWN:]}"
             tell(f"{time.strftime('%H:%M:%S')} {run}: {what} ({remaining} to go)")
     return Done(tuple(run for run in study.runs if run.place in complete), tuple(failed))
-
-
-def _on_this_machine(
-    one: Callable[[Run], str | None], runs: Sequence[Run], at_a_time: int
-) -> Iterator[tuple[Run, str | None]]:
-    """:return: runs and their errors, as they end"""
-    with ThreadPoolExecutor(at_a_time) as pool:
-        waited = {pool.submit(one, run): run for run in runs}
-        for future in as_completed(waited):
-            yield waited[future], future.result()
 
 
 def is_complete(study: Study, run: Run, folder: Path) -> bool:
@@ -178,22 +167,6 @@ def seconds_to_go(study: Study, progress: Sequence[Progress], jobs: int) -> floa
             known = durations.get((one.run.label, one.run.env), everything)
             left += max(0.0, sum(known) / len(known) - one.seconds)
     return left / jobs
-
-
-def _at_a_time(jobs: int | None, memory: float) -> int:
-    cores = os.cpu_count() or 1
-    wanted = cores if jobs is None else jobs
-    free = _free_memory()
-    return max(1, wanted if free is None else min(wanted, int(free / memory)))
-
-
-def _free_memory() -> float | None:
-    """[GiB]; None if the system does not report it."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) / 2**20
-    return None
 
 
 @contextlib.contextmanager

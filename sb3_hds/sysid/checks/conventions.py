@@ -189,7 +189,11 @@ def _swap(n: int, i: int, j: int) -> Callable[[np.ndarray], np.ndarray]:
 def _changed(motion: Motion, change: _Change) -> Motion:
     recordings = tuple(
         JointMotion(
-            change.q(r.q), *map(change.slopes, (r.v, r.a, r.raw)), change.actions(r.actions)
+            change.q(r.q),
+            change.slopes(r.v),
+            change.slopes(r.a),
+            change.slopes(r.raw),
+            change.actions(r.actions),
         )
         for r in motion.recordings
     )
