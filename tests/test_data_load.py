@@ -268,6 +268,13 @@ def test_nothing_is_unpickled(tmp_path):
     assert not (tmp_path / "owned").exists()
 
 
+def test_saved_trajectories_and_logs_are_not_mixed(tmp_path):
+    saved = Trajectories.from_arrays([np.zeros((4, 1))], [np.zeros((3, 1))], dt=DT)
+    files = [saved.save(tmp_path / "saved.npz"), write_csv(tmp_path / "log.csv", swing())]
+    with pytest.raises(TrajectoryError, match=r"was written by Trajectories\.save and cannot be"):
+        Trajectories.load(files)
+
+
 def test_core_alone_reads_our_own_files_and_says_who_reads_logs(tmp_path, monkeypatch):
     monkeypatch.setattr(trajectories, "log_reader", lambda: None)
     assert CoreTrajectories is Trajectories

@@ -131,6 +131,22 @@ def test_a_recording_is_never_overwritten_but_can_be_continued(tmp_path):
         recorder(tmp_path / "run", append=True, actions=["torque"])
 
 
+def test_a_file_that_is_no_recording_is_never_touched(tmp_path):
+    path = tmp_path / "notes.jsonl"
+    path.write_text('{"my": "only copy"}')
+
+    with pytest.raises(TrajectoryError, match="is not a recording: it begins with"):
+        recorder(path, append=True)
+    assert path.read_text() == '{"my": "only copy"}'
+
+    # A kill can leave the first half of a header, which is nobody's only copy.
+    with recorder(tmp_path / "run"):
+        header = (tmp_path / "run.jsonl").read_bytes()
+    (tmp_path / "run.jsonl").write_bytes(header[:30])
+    with recorder(tmp_path / "run", append=True):
+        assert (tmp_path / "run.jsonl").read_bytes() == header
+
+
 @each(
     (lambda path: recorder(path.parent / "no" / "where"), "must exist and be writable"),
     (lambda path: recorder(path, obs=[]), "at least one observation channel"),

@@ -261,3 +261,12 @@ def test_friction_on_damped_joints_equals_a_force_of_its_own(twin, x64):
     # The same sum in another order.
     np.testing.assert_allclose(flat(by_parameter), flat(by_force), rtol=1e-12, atol=1e-12)
     assert (np.abs(by_parameter[1] - without[1]).min(0)[list(sizes)] > 1e-7).all()
+
+
+def test_layers_have_the_forces_and_effects_of_the_twin_inside():
+    plain = twins.make("DoublePendulum")
+    extended = plain.extend(effects.CoulombFriction(0))
+
+    assert max(plain.typical_forces()) > 1.0
+    assert extended.typical_forces() == plain.typical_forces()
+    assert extended.native_effects == plain.native_effects != {}

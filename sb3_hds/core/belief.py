@@ -125,9 +125,6 @@ class BeliefTwin(Layer):
     def at_interval(self, dt: float, substeps: int) -> "BeliefTwin":
         return self._with_base(self.base.at_interval(dt, substeps), self.draws)
 
-    def typical_forces(self) -> tuple[float, ...]:
-        return self.base.typical_forces()
-
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         key, own = jax.random.split(key)
         draw = jax.random.randint(own, (), 0, len(params[_DRAWS]))

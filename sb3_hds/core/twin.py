@@ -309,7 +309,7 @@ class Twin(abc.ABC):
         self.differentiability = base.differentiability
         self.reward_has_gradient = base.reward_has_gradient
         self.parameters, self.values = base.parameters, dict(base.values)
-        self.known_parameters = base.known_parameters
+        self.known_parameters, self.native_effects = base.known_parameters, base.native_effects
         self.tensors = dict(base.tensors)
 
     def _set(self, values: Mapping[str, Any]) -> None:
@@ -340,6 +340,9 @@ class Layer(Twin):
     def inner_params(self, state: State, params: Params) -> Params:
         """:return: the parameters of the inner twin"""
         return params
+
+    def typical_forces(self) -> tuple[float, ...]:
+        return self.base.typical_forces()
 
     def coordinates(self, q: Position) -> Coordinates:
         return self.base.coordinates(q)

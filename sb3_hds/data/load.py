@@ -78,6 +78,11 @@ def _loaded(files: Files, column_map: Any) -> Trajectories:
     episodes, notes = list[Rows](), dict[str, None]()
     first: _FirstFile | None = None
     for path in paths:
+        if given is None and _is_saved(path):
+            raise TrajectoryError(
+                f"'{path}' was written by Trajectories.save and cannot be loaded together with "
+                "other files. Load them apart, and join them by Trajectories.concatenate."
+            )
         log = _read(path, given)
         columns, remarks = _with_units((given or Columns()).over(log.columns), log)
         first = first or _FirstFile(path, columns, frozenset(log.tables[0]))

@@ -147,6 +147,12 @@ class Recorder:
         content = self.path.read_bytes()
         end = content.rfind(b"\n") + 1
         if not end:
+            beginning = (json.dumps(header, separators=(",", ":")) + "\n").encode()
+            if not beginning.startswith(content):
+                raise TrajectoryError(
+                    f"'{self.path}' is not a recording: it begins with {content[:60]!r}. Choose "
+                    "another file."
+                )
             self.path.unlink()
             return False
         earlier = _parse(content.partition(b"\n")[0], self.path, 1)

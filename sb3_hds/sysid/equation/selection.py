@@ -68,13 +68,7 @@ def _friction_beside(p: Problem, others: list[int]) -> list[int]:
     """Viscous and dry friction at all joints, without what would have a negative size."""
     names = (_VISCOUS, _DRY)
     friction = [i for i, item in enumerate(p.items) if item.candidate.name in names]
-    keys = friction + others
-    while True:
-        held = p.solve(keys).held
-        bad = [i for i in keys if i in friction and p.items[i].columns[0] in held]
-        if not bad:
-            return keys
-        keys = [i for i in keys if i not in bad]
+    return _within_bounds(p, others, friction)
 
 
 # ------------------------------------------------------------------------------ moves
@@ -132,14 +126,13 @@ def _at_all_joints(p: Problem, keys: list[int]) -> list[list[int]]:
 
 
 def _within_bounds(p: Problem, keys: list[int], new: list[int]) -> list[int]:
-    while new:
-        found = p.solve([*keys, *new])
-        value = dict(zip(found.free, found.theta, strict=True))
-        bad = [i for i in new if any(value[c] < p.lower[c] for c in p.items[i].free if c in value)]
+    """Add new items, without those whose size would be beyond a bound."""
+    while True:
+        held = p.solve([*keys, *new]).held
+        bad = [i for i in new if any(c in held for c in p.items[i].free)]
         if not bad:
-            break
+            return [*keys, *new]
         new = [i for i in new if i not in bad]
-    return [*keys, *new]
 
 
 def _try_shared(p: Problem, keys: list[int]) -> list[int]:
