@@ -13,6 +13,7 @@ from measuring import measured
 from sb3_hds import Trajectories, audit, twins
 from sb3_hds.core import Channel, State
 from sb3_hds.data import Finding
+from sb3_hds.data.audit.velocity import velocity_pairs
 from sb3_hds.effects import CoulombFriction
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.sysid.checks.timing import align_velocities
@@ -586,3 +587,15 @@ def test_a_single_sample_that_jumps_away_and_back_is_refused_and_cut_out(channel
     assert [p.first for p in finding.places] == [100 + 10 * i for i in range(8)]
     assert f"'{KNOWN[channel].name}' jumps to" in found.reason
     assert audit(better, KNOWN).findings == () and len(better) == 16
+
+
+def test_velocities_of_long_data_are_compared_on_stretches():
+    dt = 0.01
+    t = dt * np.arange(400_000)
+    q, late = np.sin(3.0 * t), 3.0 * np.cos(3.0 * (t - 2.0 * dt))
+    data = Trajectories.from_arrays([np.stack([q, late], 1)], [np.zeros((len(t) - 1, 1))], dt=dt)
+
+    (pair,) = velocity_pairs(data, ["q", "v"])
+
+    assert pair.samples == pytest.approx(2.0, abs=1e-3)
+    assert sum(len(v) for _, v in pair.signals) == 100_000

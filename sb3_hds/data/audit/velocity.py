@@ -21,6 +21,7 @@ _FEWEST, _MOST = 8, 100  # samples
 _SHORTEST = 24  # steps of an episode; shorter ones are ignored
 _PER_REACH = 4  # steps of an episode for each sample of the longest shift
 _WIDTHS = (1, 3, 7, 15, 31)  # samples of the moving average; the first that identifies a pair
+_MOST_ROWS, _STRETCH = 100_000, 10_000  # rows that are compared; longer data: stretches of them
 _CLEAR = 0.95  # smallest correlation of a position's derivative with its velocity
 _SAME_SCALE = 0.25  # largest difference of their ratio from 1
 _CIRCLE = 0.1  # largest root mean square of cos^2 + sin^2 - 1
@@ -282,6 +283,7 @@ def velocity_pairs(data: Trajectories, names: Sequence[str]) -> list[VelocityPai
     episodes = [data.episode(i)[0] for i, n in enumerate(data.lengths) if n >= _SHORTEST]
     if not episodes:
         return []
+    episodes = _stretches(episodes)
     wanted = int(np.clip(round(_REACH / data.dt), _FEWEST, _MOST))
     reach = min(wanted, *(len(x) // _PER_REACH for x in episodes))
     found = []
@@ -298,6 +300,15 @@ def velocity_pairs(data: Trajectories, names: Sequence[str]) -> list[VelocityPai
                     found.append(VelocityPair(v, *about, all_samples(data)))
                     break
     return found
+
+
+def _stretches(episodes: list[np.ndarray]) -> list[np.ndarray]:
+    """All episodes, or evenly spaced stretches of them where they are long."""
+    if sum(map(len, episodes)) <= _MOST_ROWS:
+        return episodes
+    parts = [part for x in episodes for part in np.array_split(x, max(len(x) // _STRETCH, 1))]
+    chosen = np.linspace(0, len(parts) - 1, min(_MOST_ROWS // _STRETCH, len(parts)))
+    return [parts[int(i)] for i in chosen]
 
 
 def _positions(
