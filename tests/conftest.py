@@ -50,6 +50,36 @@ def no_pickle(monkeypatch):
             monkeypatch.setattr(module, name, refuse)
 
 
+class Cluster:
+    """Two nodes on this machine, each with two cores to give."""
+
+    def __init__(self) -> None:
+        from ray.cluster_utils import Cluster as Nodes
+
+        node = {"num_cpus": 2, "memory": 4 * 2**30, "object_store_memory": 80 * 2**20}
+        self.nodes = Nodes(initialize_head=True, head_node_args=node)
+        self.second = self.nodes.add_node(**node)
+        self.nodes.wait_for_nodes()
+
+    @property
+    def address(self):
+        return self.nodes.address
+
+    def lose_one(self):
+        self.nodes.remove_node(self.second, allow_graceful=False)
+
+
+@pytest.fixture
+def cluster():
+    pytest.importorskip("ray")
+    try:
+        made = Cluster()
+    except (OSError, RuntimeError) as error:
+        pytest.skip(f"Ray does not start on this machine: {error}")
+    yield made
+    made.nodes.shutdown()
+
+
 _MAPS = Path("/proc/self/maps")
 _MOST_MAPS = 20_000
 _since_look = itertools.count(1)

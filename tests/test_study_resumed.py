@@ -73,36 +73,6 @@ def test_without_a_cluster_it_is_said_how_to_start_one(tmp_path):
         run_study(study_of(tmp_path), tmp_path / "logs", ray="127.0.0.1:1")
 
 
-class Cluster:
-    """Two nodes on this machine, each with two cores to give."""
-
-    def __init__(self) -> None:
-        from ray.cluster_utils import Cluster as Nodes
-
-        node = {"num_cpus": 2, "memory": 4 * 2**30, "object_store_memory": 80 * 2**20}
-        self.nodes = Nodes(initialize_head=True, head_node_args=node)
-        self.second = self.nodes.add_node(**node)
-        self.nodes.wait_for_nodes()
-
-    @property
-    def address(self):
-        return self.nodes.address
-
-    def lose_one(self):
-        self.nodes.remove_node(self.second, allow_graceful=False)
-
-
-@pytest.fixture
-def cluster():
-    pytest.importorskip("ray")
-    try:
-        made = Cluster()
-    except (OSError, RuntimeError) as error:
-        pytest.skip(f"Ray does not start on this machine: {error}")
-    yield made
-    made.nodes.shutdown()
-
-
 @pytest.mark.expensive
 def test_a_node_is_lost_and_no_run_is(cluster, tmp_path):
     study = study_of(tmp_path, algorithms=["hds", "droq"], seeds=100)
@@ -126,7 +96,6 @@ def test_a_node_is_lost_and_no_run_is(cluster, tmp_path):
     assert len(said) == 200
     for run in study.runs:
         assert (folder / run.place / "progress").read_text() == "0\n1\n2\n3\n4\n"
-    # Only what was at work on the node that was lost is made again.
     # Only what was at work on the node that was lost is made again.
     assert 200 <= ledger.read_text().count("begun") <= 202
     assert {one.state for one in progress_of(study, folder)} == {"complete"}

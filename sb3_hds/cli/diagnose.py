@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from sb3_hds.sysid.design import NextExperiment
 
 
+# Options that --each excludes.
+_OF_ONE = ("report", "animate", "json", "write", "next", "env")
+
+
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """:param command: ``sb3-hds diagnose``"""
     measured.add_arguments(command)
@@ -65,11 +69,76 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     gain.add_argument(
         "--hyperparams", nargs="*", default=[], metavar="NAME:VALUE", help="hyperparameters"
     )
+    each = command.add_argument_group("many logs", "each file diagnosed on its own")
+    each.add_argument(
+        "--each", metavar="FOLDER", help="for results, pages and a table; resumes where it was"
+    )
+    each.add_argument("--jobs", type=int, help="parallel diagnoses; default: one per core")
+    each.add_argument(
+        "--memory", type=float, default=4.0, help="memory per diagnosis [GiB]; default: 4"
+    )
+    each.add_argument(
+        "--ray", metavar="ADDRESS", help="run on the Ray cluster at this address, or auto"
+    )
+    each.add_argument(
+        "--cpus", type=float, default=2.0, help="cores per diagnosis, with --ray; default: 2"
+    )
     command.set_defaults(run=run)
 
 
-def run(given: argparse.Namespace) -> None:
-    """Load the data, diagnose, and report on the screen, as a page and as JSON."""
+def run(given: argparse.Namespace) -> int:
+    """
+    Load the data, diagnose, and report on the screen, as a page and as JSON.
+
+    :return: with ``--each``, 1 if a diagnosis failed, else 0
+    """
+    if given.each:
+        return _run_each(given)
+    for option in ("jobs", "ray"):
+        if getattr(given, option) is not None:
+            raise ParameterError(f"--{option} is about many logs: name a folder with --each.")
+    return _run_one(given)
+
+
+def _run_each(given: argparse.Namespace) -> int:
+    from sb3_hds.data.load import paths_of
+    from sb3_hds.experiments.many_logs import diagnose_each
+    from sb3_hds.sysid.reporting.page import check_installed
+
+    for option in _OF_ONE:
+        if getattr(given, option):
+            raise ParameterError(
+                f"--{option} is about a single diagnosis; --each writes a JSON file and a page of "
+                "each log into its folder."
+            )
+    check_installed()
+    found = diagnose_each(
+        paths_of(given.data),
+        _arguments_of(given),
+        given.each,
+        jobs=given.jobs,
+        memory=given.memory,
+        ray=given.ray,
+        cpus=given.cpus,
+    )
+    failed = sum(bool(one.error) for one in found)
+    print(f"{len(found) - failed} of {len(found)} logs are diagnosed in {given.each}.")
+    return 1 if failed else 0
+
+
+def _arguments_of(given: argparse.Namespace) -> list[str]:
+    """What all diagnoses of ``--each`` share, as words of the command line."""
+    words = ["--correct"] if given.correct else []
+    for option in ("twin", "model", "columns", "budget", "seed"):
+        value = getattr(given, option)
+        words += [] if value is None else [f"--{option}", str(value)]
+    for option in ("set", "actuators", "ignore", "calibrate", "effects"):
+        values = getattr(given, option)
+        words += [f"--{option}", *values] if values else []
+    return words
+
+
+def _run_one(given: argparse.Namespace) -> int:
     from sb3_hds.data import audit
     from sb3_hds.effects import ALL
     from sb3_hds.sysid import diagnose
@@ -109,6 +178,7 @@ def run(given: argparse.Namespace) -> None:
     experiment = _next_experiment(given, found)
     if given.report:
         print(f"The report is {found.to_html(given.report, gain, experiment)}.")
+    return 0
 
 
 def _next_experiment(given: argparse.Namespace, found: "Diagnosis") -> "NextExperiment | None":

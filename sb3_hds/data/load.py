@@ -71,7 +71,7 @@ def load(files: Files, columns: Any = None) -> Trajectories:
 
 def _loaded(files: Files, column_map: Any) -> Trajectories:
     given = None if column_map is None else columns_from(column_map)
-    paths = _paths(files)
+    paths = paths_of(files)
     if given is None and all(_is_saved(path) for path in paths):
         return Trajectories.concatenate([Trajectories.load(path) for path in paths])
     # One file at a time, of which only the columns that are used are kept in memory.
@@ -101,7 +101,7 @@ def first_log(files: Files, given: Columns | None) -> Log | None:
     :return: the first file as a log; None if it was written by ``Trajectories.save``
     :raises TrajectoryError: if it cannot be read
     """
-    path = _paths(files)[0]
+    path = paths_of(files)[0]
     if given is None and _is_saved(path):
         return None
     return read_log(path, given or Columns())
@@ -115,8 +115,11 @@ class _FirstFile(NamedTuple):
     names: frozenset[str]
 
 
-def _paths(files: Any) -> list[str]:
-    """All files, with patterns expanded."""
+def paths_of(files: Any) -> list[str]:
+    """
+    :return: all files, with patterns expanded
+    :raises TrajectoryError: for a pattern that no file matches, or a file that is named twice
+    """
     several = not isinstance(files, str | os.PathLike)
     if several and not isinstance(files, Iterable):
         raise TrajectoryError(f"files must be paths or patterns, got {files!r}.")

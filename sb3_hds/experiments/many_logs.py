@@ -1,5 +1,7 @@
 """The same diagnosis of many logs, each in a process of its own, here or on a Ray cluster."""
 
+import csv
+import io
 import json
 import os
 import subprocess
@@ -15,22 +17,27 @@ from sb3_hds.errors import StudyError
 from sb3_hds.experiments.cluster import Share, on_cluster, on_this_machine
 
 _ARGUMENTS, _TABLE = "arguments.json", "verdicts.csv"
-_COLUMNS = ("log", "verdict", "causes", "error")
+# Output files of a diagnosis by option. The page is written last, so it marks a complete one.
+_OUTPUT = {"--json": ".json", "--report": ".html"}
 
 
 class LogVerdict(NamedTuple):
     """
     The diagnosis of one log.
 
+    :param log: its file
     :param verdict: empty if it failed
     :param causes: names and places
-    :param error: last line of its output, if it failed
+    :param error: the last line that it printed, if it failed
     """
 
     log: str
     verdict: str
     causes: tuple[str, ...]
     error: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.log}: {self.error or ' '.join((self.verdict, *self.causes))}"
 
 
 def diagnose_each(
@@ -74,7 +81,7 @@ def diagnose_each(
     for remaining, (log, error) in zip(reversed(range(len(waiting))), ended, strict=True):
         errors |= {log: error} if error else {}
         verdict = _verdict_of(root, log, names[log], error)
-        tell(f"{time.strftime('%H:%M:%S')} {_line_of(verdict)} ({remaining} to go)")
+        tell(f"{time.strftime('%H:%M:%S')} {verdict} ({remaining} to go)")
     found = [_verdict_of(root, log, names[log], errors.get(log, "")) for log in logs]
     _write_table(root / _TABLE, found)
     return found
@@ -111,7 +118,7 @@ def _claim(root: Path, arguments: list[str]) -> None:
 
 
 def _is_complete(root: Path, name: str) -> bool:
-    return all((root / f"{name}{suffix}").exists() for suffix in (".json", ".html"))
+    return all((root / f"{name}{suffix}").exists() for suffix in _OUTPUT.values())
 
 
 def _diagnose(
@@ -121,35 +128,30 @@ def _diagnose(
     if not (root / _ARGUMENTS).exists():
         return f"This node cannot access '{root}': a cluster needs a folder that all nodes share."
     command = [sys.executable, "-m", "sb3_hds.cli", "diagnose", *arguments, "--data", log]
-    output = [f"--{kind}={root / names[log]}.{suffix}" for kind, suffix in _OUTPUT]
-    done = subprocess.run([*command, *output], capture_output=True, text=True, cwd=cwd)
-    if done.returncode:
-        said = done.stderr.strip().splitlines() or [f"it exited with {done.returncode}"]
-        return said[-1].removeprefix("sb3-hds: ")
-    return ""
-
-
-# The page is written last: with it, a diagnosis is complete.
-_OUTPUT = (("json", "json"), ("report", "html"))
+    for option, suffix in _OUTPUT.items():
+        command += [option, f"{root / names[log]}{suffix}"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=cwd)
+    if not done.returncode:
+        return ""
+    lines = done.stderr.strip().splitlines()
+    return lines[-1].removeprefix("sb3-hds: ") if lines else f"it exited with {done.returncode}"
 
 
 def _verdict_of(root: Path, log: str, name: str, error: str) -> LogVerdict:
     if error:
         return LogVerdict(log, "", (), error)
     found: dict[str, Any] = json.loads((root / f"{name}.json").read_text(encoding="utf-8"))
-    return LogVerdict(log, found["verdict"], tuple(one["key"] for one in found["findings"]))
+    return LogVerdict(log, found["verdict"], tuple(map(_cause, found["findings"])))
 
 
-def _line_of(one: LogVerdict) -> str:
-    return f"{one.log}: {one.error or ' '.join(filter(None, (one.verdict, ', '.join(one.causes))))}"
+def _cause(finding: dict[str, Any]) -> str:
+    effect, where = finding["effect"], finding["where"]
+    return effect if where["slot"] == "parameter" else f"{effect}.{where['name']}"
 
 
 def _write_table(path: Path, found: Sequence[LogVerdict]) -> None:
-    import csv
-    import io
-
     text = io.StringIO(newline="")
     rows = csv.writer(text)
-    rows.writerow(_COLUMNS)
+    rows.writerow(LogVerdict._fields)
     rows.writerows((one.log, one.verdict, " ".join(one.causes), one.error) for one in found)
     write_bytes(path, text.getvalue().encode())
