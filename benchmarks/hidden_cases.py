@@ -86,8 +86,9 @@ _CONDITIONS = (
     *((False, 0.02), (False, 0.05)) * 2,
     *((True, 0.02), (True, 0.05)),
 )
-# How often an impossible case is redrawn, and how many of these times with the same effect.
-_TRIES, _SAME = 200, 20
+# How often an impossible case is redrawn, and how many of these times with the same effect, and
+# with the same size.
+_TRIES, _SAME, _SAME_SIZE = 200, 20, 50
 
 # Of twins from model files, within an interval of 20 ms.
 _SUBSTEPS = 5
@@ -202,6 +203,9 @@ def draw(
         asked=turn % ASKED == 0 and kind != EULERS,
     )
     for again in range(_TRIES):
+        # Where the detection limit is high, a large multiple may be more than a rig can have.
+        if again and again % _SAME_SIZE == 0:
+            case = dataclasses.replace(case, factor=0.5 * case.factor)
         rng = np.random.default_rng([number, zlib.crc32(system.encode()), again])
         changed = _planted(case, deal, rng, again)
         if changed is None:

@@ -33,8 +33,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +61,13 @@ from same_cause import equals
 from several_scores import RULE as RULE_OF_SEVERAL
 from several_scores import SEVERAL
 
+from sb3_hds.experiments.cluster import Share, on_cluster, on_this_machine
+
 # Number of cases of one system that one process runs, so that it compiles once.
 BLOCK = 40
+# The same on a node of a cluster, and its memory [GiB].
+_ON_A_NODE, _MEMORY = 10, 4.0
+_SCRIPT = str(Path(__file__).resolve())
 # One additional case of the Euler twin for so many others.
 _EULER = 50
 # And one is of each rig whose twin comes from a model file, torques and servos apart: a diagnosis
@@ -82,7 +86,10 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=1000, help="of all five systems together")
     parser.add_argument("--systems", nargs="*", default=list(RIGS), choices=RIGS)
     parser.add_argument("--kinds", nargs="*", choices=(*SHARES, EULERS))
-    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--jobs", type=int, help="processes at a time; default: 1")
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="of a Ray cluster that shares this folder, or auto"
+    )
     parser.add_argument("--budget", default="full", choices=("full", "quick"))
     parser.add_argument("--report-only", "--figure", action="store_true")
     parser.add_argument("--worker", nargs=3, metavar=("SYSTEM", "BUDGET", "CASES"))
@@ -95,7 +102,7 @@ def main() -> None:
     check_mismatch(arguments.systems)
     if not arguments.report_only:
         wanted = numbers(arguments.cases, arguments.systems, arguments.kinds)
-        failed = go(table, wanted, arguments.budget, arguments.jobs)
+        failed = go(table, wanted, arguments.budget, arguments.jobs, arguments.ray)
         if failed:
             print(f"{failed} cases failed; the same command tries them again.", file=sys.stderr)
     report(table)
@@ -119,30 +126,32 @@ def numbers(cases: int, systems: Sequence[str], only: Sequence[str] | None) -> d
     return found
 
 
-def go(table: str, wanted: dict[str, list[int]], budget: str, jobs: int) -> int:
+def go(
+    table: str, wanted: dict[str, list[int]], budget: str, jobs: int | None, ray: str | None
+) -> int:
     """:return: how many cases failed"""
-    done = {(row["system"], row["case"]) for row in read(table)}
-    left = {s: [n for n in cases if (s, n) not in done] for s, cases in wanted.items()}
-    longest = max(map(len, left.values()), default=0)
+    left = _missing(table, wanted)
+    longest, size = max(map(len, left.values()), default=0), BLOCK if ray is None else _ON_A_NODE
     # Systems alternate, so that the finished cases are representative at any time.
     blocks = [
-        (system, cases[first : first + BLOCK])
-        for first in range(0, longest, BLOCK)
+        (system, budget, cases[first : first + size])
+        for first in range(0, longest, size)
         for system, cases in left.items()
         if first < len(cases)
     ]
+    ended = (
+        on_this_machine(in_process, blocks, jobs or 1, _MEMORY)
+        if ray is None
+        else on_cluster(in_process, blocks, ray, Share(2.0, 0.0, _MEMORY), jobs)
+    )
+    for _ in ended:
+        pass
+    return sum(map(len, _missing(table, wanted).values()))
 
-    def one(block: tuple[str, list[int]]) -> int:
-        system, cases = block
-        kept = 0
-        for row in in_process(system, budget, cases):
-            keep(table, row)
-            print(line_of(row), file=sys.stderr, flush=True)
-            kept += 1
-        return len(cases) - kept
 
-    with ThreadPoolExecutor(jobs) as pool:
-        return sum(pool.map(one, blocks))
+def _missing(table: str, wanted: dict[str, list[int]]) -> dict[str, list[int]]:
+    done = {(row["system"], row["case"]) for row in read(table)}
+    return {s: [n for n in cases if (s, n) not in done] for s, cases in wanted.items()}
 
 
 def line_of(row: dict[str, Any]) -> str:
@@ -154,19 +163,16 @@ def line_of(row: dict[str, Any]) -> str:
     )
 
 
-def in_process(system: str, budget: str, cases: list[int]) -> Iterator[dict[str, Any]]:
-    """:return: rows, each as soon as the process has finished its case"""
+def in_process(block: tuple[str, str, list[int]]) -> None:
+    """Run the cases of a block in a process that adds each to the table as soon as it ends."""
+    system, budget, cases = block
     surroundings = os.environ | {
         "SB3_HDS_CACHE": str(CACHE),
         "JAX_COMPILATION_CACHE_DIR": str(CACHE),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
     }
-    command = [sys.executable, __file__, "--worker", system, budget, ",".join(map(str, cases))]
-    with subprocess.Popen(command, env=surroundings, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.startswith("{"):
-                yield json.loads(line)
+    words = [sys.executable, _SCRIPT, "--worker", system, budget, ",".join(map(str, cases))]
+    subprocess.run(words, env=surroundings, check=False)
 
 
 def work(system: str, budget: str, cases: list[int]) -> None:
@@ -178,7 +184,8 @@ def work(system: str, budget: str, cases: list[int]) -> None:
         except Exception:  # one case that fails must not take the others with it
             print(f"{system} {number} failed:\n{traceback.format_exc()}", file=sys.stderr)
             continue
-        print(json.dumps(row), flush=True)
+        keep(name_of_table(budget), row)
+        print(line_of(row), file=sys.stderr, flush=True)
         if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
             jax.clear_caches()
 

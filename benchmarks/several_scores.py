@@ -22,12 +22,14 @@ class CaseScore(NamedTuple):
     :param within: for each of them, whether it was named or in the set of a finding
     :param right: for each finding, whether its name is a planted cause
     :param among: for each finding, whether its name or an alternative in its set is a planted cause
+    :param alone: for each finding without alternatives, whether its name is a planted cause
     """
 
     named: list[bool]
     within: list[bool]
     right: list[bool]
     among: list[bool]
+    alone: list[bool]
 
     @property
     def flawless(self) -> bool:
@@ -60,6 +62,7 @@ def score_case(
         within=[bool(own & every) for own in shown],
         right=[right(s[:1]) for s in sets],
         among=[right(s) for s in sets],
+        alone=[right(s) for s in sets if len(s) == 1],
     )
 
 
@@ -98,6 +101,7 @@ def scores(rows: pd.DataFrame) -> list[Score]:
         share("detectable planted causes: named or in a set", _every(found, "within"), least=0.95),
         share("detectable planted causes: named", _every(found, "named")),
         share("names that are right", _every(found, "right"), least=0.97),
+        share("names without an alternative that are right", _every(found, "alone")),
         share("cases: all right, none missing", [one.flawless for one in found], least=0.85),
         share("the same, sets included", [one.flawless_with_sets for one in found]),
         share("90 % intervals that cover the truth", covered, least=0.85, most=0.95),
