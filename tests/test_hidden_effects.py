@@ -153,7 +153,7 @@ def test_a_later_finding_may_be_the_wrong_name_and_none_is_not_what_was_expected
         (1 / 5, "a wrong name, all data", rows[:5]),
         (1.0, "refused: outside the catalogue", rows),
         (0.5, "called unknown: outside the catalogue", rows),
-        (0.5, "90 % intervals that cover", rows[1:2]),
+        (0.5, "90 % intervals that cover the truth", rows[1:2]),
         (0.5 * (0.1 / 1.1 + 0.5), "error of a parameter, median", rows[1:2]),
         (1 / 2, "false alarms: null", rows),
         (2 / 4, "Euler's twin: late or unknown", rows),
