@@ -156,7 +156,7 @@ def test_a_later_finding_may_be_the_wrong_name_and_none_is_not_what_was_expected
         (0.5, "90 % intervals that cover the truth", rows[1:2]),
         (0.5 * (0.1 / 1.1 + 0.5), "error of a parameter, median", rows[1:2]),
         (1 / 2, "false alarms: null", rows),
-        (2 / 4, "Euler's twin: late or unknown", rows),
+        (2 / 4, "Euler's twin: delay or unknown", rows),
         (1 / 4, "Euler's twin: friction named", rows),
     ):
         assert score(some, label).value == pytest.approx(expected), label
