@@ -1,6 +1,6 @@
 """Standard errors, profile likelihoods, family-wise p-values, aliased candidates."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -89,6 +89,28 @@ def detectable(half: Half, point: Point) -> dict[str, dict[str, float]]:
             size = np.sqrt(2.0 * needed / curvature) if curvature > 1e-12 else np.inf
             sizes[name.rpartition(".")[2]] = float(size * h.scale[i])
         found[candidate.key] = sizes
+    return found
+
+
+def detectable_sizes(
+    half: Half, point: Point, by_equation: Mapping[str, Mapping[str, float]]
+) -> dict[str, dict[str, float]]:
+    """
+    By candidate, where the equation of motion proposes it and a simulation confirms it. Of what is
+    not simulated, or has no derivative at the null, by the equation: as much larger as errors that
+    are too small to matter make the residual.
+
+    :param point: the nominal model, nuisances refitted
+    :param by_equation: what the equation of motion shows, by candidate and parameter
+    """
+    found = detectable(half, point)
+    left = float(np.mean((point.raw / half.evidence.noise) ** 2, (1, 2)).sum())
+    larger = np.sqrt(half.total(point) / left) if left > 0.0 else 1.0
+    for key, sizes in by_equation.items():
+        simulated = {n: x for n, x in found.get(key, {}).items() if np.isfinite(x)}
+        found[key] = {
+            name: max(size, simulated.get(name, larger * size)) for name, size in sizes.items()
+        }
     return found
 
 

@@ -15,7 +15,7 @@ from sb3_hds.sysid.checks.conventions import Convention
 from sb3_hds.sysid.checks.timing import stepping_by
 from sb3_hds.sysid.comparison.halves import Base, Effort, Tried
 from sb3_hds.sysid.comparison.held_out import Comparison, as_good
-from sb3_hds.sysid.comparison.inference import detectable
+from sb3_hds.sysid.comparison.inference import detectable_sizes
 from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.comparison.several import confirmed_set, proposed_set
 from sb3_hds.sysid.diagnosis.findings import (
@@ -257,23 +257,6 @@ class Inquiry:
         noise = np.mean(error**2, (0, 1)) + (IRRELEVANT * self.given.spread) ** 2
         self._use(self.search.with_noise(np.sqrt(noise)))
 
-    def _detectable(self, start: Base) -> dict[str, dict[str, float]]:
-        """
-        :return: by candidate, where the equation of motion proposes it and a simulation confirms
-            it. Of what is not simulated, or has no slope where nothing is wrong, by the equation:
-            as much larger as errors that are too small to matter make what is left.
-        """
-        half, point = self.search.select, start.point
-        found = detectable(half, point)
-        left = float(np.mean((point.raw / half.evidence.noise) ** 2, (1, 2)).sum())
-        larger = np.sqrt(half.total(point) / left) if left > 0.0 else 1.0
-        for key, sizes in self.screened.detectable.items() if self.screened else ():
-            simulated = {n: x for n, x in found.get(key, {}).items() if np.isfinite(x)}
-            found[key] = {
-                name: max(size, simulated.get(name, larger * size)) for name, size in sizes.items()
-            }
-        return found
-
     def _extended(self, causes: Sequence[str], theta: np.ndarray) -> Twin:
         """:return: the twin as it came, at its own interval, with these causes in it"""
         twin = self.hypotheses.extended_by(causes, theta)
@@ -368,7 +351,9 @@ class Inquiry:
             explained=self.residuals.explained(found, start, base, before, left)
             if findings
             else 0.0,
-            detectable=self._detectable(start),
+            detectable=detectable_sizes(
+                self.search.select, start.point, self.screened.detectable if self.screened else {}
+            ),
             rejected=tuple(
                 Rejected(one.key, c.gain, c.p_value, why(c, self.rejected_for.get(one.key)))
                 for one, c in sorted(rejected, key=lambda pair: -pair[1].gain)
