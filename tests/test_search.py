@@ -6,6 +6,7 @@ from test_diagnose import TWIN, on_engine
 
 from sb3_hds import effects
 from sb3_hds.sysid.comparison.search import places_of
+from sb3_hds.sysid.diagnosis.findings import _widened
 from sb3_hds.sysid.diagnosis.pipeline import Inquiry
 
 KINDS = (effects.ViscousFriction, effects.CoulombFriction, effects.StribeckFriction)
@@ -47,3 +48,9 @@ def test_fits_begin_where_they_are_told_to(searched):
 def test_a_search_cannot_be_changed(searched):
     with pytest.raises(AttributeError):
         searched.places = {}
+
+
+def test_intervals_of_several_causes_are_no_narrower_than_models_are_exact():
+    low, high = _widened(2.0, 1.999, 2.003, 0.02)
+    assert low == pytest.approx(2.0 - np.hypot(0.001, 0.02))
+    assert high == pytest.approx(2.0 + np.hypot(0.003, 0.02))

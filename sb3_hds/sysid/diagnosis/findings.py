@@ -26,6 +26,9 @@ NO_CONSTANT = "it comes near, but its size is not constant"
 NAMELESS = "a force without a name predicts better"
 ANOTHER = "its fitted sizes are those of another effect"
 _CONFIDENCE = 0.9
+# Of several causes, half the width of an interval is at least this share of the size: neither the
+# twin's integrator nor the smoothing of the equation of motion is better than that.
+_INEXACT = 0.01
 # Family-wise level of what contradicts that nothing is wrong, though it is no finding.
 _CONTRADICTS = 0.01
 # Error of a window that a twin does not come near, in units of the noise, or of what is usual.
@@ -76,13 +79,15 @@ def finding(
     for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
         if name in one.sizes and one.of_equation:
             estimate, low, high = one.sizes[name]
+            low, high = _widened(estimate, low, high, _INEXACT * abs(estimate))
             error = float((high - low) / (2.0 * unit))
         else:
             low, high = _interval(half, point, free, i, float(reach[i]), profiles)
             estimate = float(theta[i])
             off = np.hypot(one.doubts.get(name, 0.0), _systematic(estimate, one.sizes.get(name)))
-            low = max(estimate - float(np.hypot(estimate - low, off)), float(h.lower[i]))
-            high = min(estimate + float(np.hypot(high - estimate, off)), float(h.upper[i]))
+            off = np.hypot(off, _INEXACT * abs(estimate) if one.sizes else 0.0)
+            low, high = _widened(estimate, low, high, off)
+            low, high = max(low, float(h.lower[i])), min(high, float(h.upper[i]))
             error = float(np.hypot(stderr[i], off / unit))
         short = name.rpartition(".")[2]
         # Of several places, each has its own.
@@ -108,6 +113,14 @@ def finding(
         one.verdict.gain,
         candidate.explanation,
         one.share,
+    )
+
+
+def _widened(estimate: float, low: float, high: float, off: float) -> tuple[float, float]:
+    """:param off: half the width of an independent error"""
+    return (
+        estimate - float(np.hypot(estimate - low, off)),
+        estimate + float(np.hypot(high - estimate, off)),
     )
 
 
