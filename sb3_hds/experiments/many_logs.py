@@ -71,7 +71,7 @@ def diagnose_each(
     names = _names_of(logs)
     _claim(root, list(arguments))
     waiting = [log for log in logs if not _is_complete(root, names[log])]
-    errors: dict[str, str] = {}
+    found = {log: _verdict_of(root, log, names[log]) for log in logs if log not in waiting}
     one = partial(_diagnose, names=names, arguments=arguments, root=root, cwd=os.getcwd())
     ended = (
         on_this_machine(one, waiting, jobs, memory)
@@ -79,12 +79,11 @@ def diagnose_each(
         else on_cluster(one, waiting, ray, Share(cpus, 0.0, memory), jobs)
     )
     for remaining, (log, error) in zip(reversed(range(len(waiting))), ended, strict=True):
-        errors |= {log: error} if error else {}
-        verdict = _verdict_of(root, log, names[log], error)
-        tell(f"{time.strftime('%H:%M:%S')} {verdict} ({remaining} to go)")
-    found = [_verdict_of(root, log, names[log], errors.get(log, "")) for log in logs]
-    _write_table(root / _TABLE, found)
-    return found
+        found[log] = _verdict_of(root, log, names[log], error)
+        tell(f"{time.strftime('%H:%M:%S')} {found[log]} ({remaining} to go)")
+    verdicts = [found[log] for log in logs]
+    _write_table(root / _TABLE, verdicts)
+    return verdicts
 
 
 def _names_of(logs: Sequence[str]) -> dict[str, str]:
@@ -137,7 +136,7 @@ def _diagnose(
     return lines[-1].removeprefix("sb3-hds: ") if lines else f"it exited with {done.returncode}"
 
 
-def _verdict_of(root: Path, log: str, name: str, error: str) -> LogVerdict:
+def _verdict_of(root: Path, log: str, name: str, error: str = "") -> LogVerdict:
     if error:
         return LogVerdict(log, "", (), error)
     found: dict[str, Any] = json.loads((root / f"{name}.json").read_text(encoding="utf-8"))

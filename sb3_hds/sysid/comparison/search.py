@@ -246,15 +246,6 @@ class Search(NamedTuple):
         n_steps = _FEW_STEPS if roughly else _ALL_STEPS
         return self.fit(self.hypotheses.nameless, base, n_steps=n_steps)
 
-    def fit_in_place(self, beside: Sequence[Tried], without: Base, rival: float) -> list[Tried]:
-        """
-        :param beside: fitted beside a model
-        :param without: that model without some of its causes
-        :param rival: cost to come below; what does not is given up
-        :return: the same candidates in the place of these causes, fitted to the end, best first
-        """
-        return self.fit([t.candidate for t in beside], without, places_of(beside), rival)
-
     def _guessed(self, candidates: Sequence[Candidate], base: Base) -> dict[str, Place]:
         """Where fits of candidates begin."""
         if not candidates:

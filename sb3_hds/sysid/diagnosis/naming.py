@@ -151,7 +151,9 @@ class Naming:
         for place in places if forces else ():
             taken = [one.tried.candidate for one in place]
             without = self.search.without(base, *taken, rival=base)
-            best = self.search.fit_in_place(forces, without, base.point.cost)[0]
+            candidates = [force.candidate for force in forces]
+            fits = self.search.fit(candidates, without, places_of(forces), base.point.cost)
+            best = fits[0]
             if self._predicts_better(best, base):
                 self.rejected_for |= dict.fromkeys(keys_of(place), NAMELESS)
                 rest = [one for one in found if one not in place]

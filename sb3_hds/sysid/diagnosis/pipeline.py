@@ -245,9 +245,7 @@ class Inquiry:
         self._set_noise(base.point)
         base = self.search.base(self.hypotheses.null, self.hypotheses.nuisances)
         screened = self.search.screen(base, [])
-        likely = screened[:_FOR_NOISE]
-        near = {rough.candidate.key: rough.place for rough in likely}
-        tried = self.search.fit([rough.candidate for rough in likely], base, near)
+        tried = self.search.finalists(base, [], screened[:_FOR_NOISE])
         self._use(self.search.from_places(screened, tried))
         self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
 
