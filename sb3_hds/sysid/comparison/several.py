@@ -1,16 +1,18 @@
 """Several causes at once: a set that equation errors propose, judged by simulation."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from sb3_hds.sysid.comparison.halves import NOT_FINITE, Base, Half, Tried
 from sb3_hds.sysid.comparison.held_out import LEAST_GAIN, Comparison, as_good, confirm, passes
-from sb3_hds.sysid.comparison.search import Search
+from sb3_hds.sysid.comparison.search import Place, Search
 from sb3_hds.sysid.diagnosis.findings import Accepted
 from sb3_hds.sysid.equation.members import Member
 from sb3_hds.sysid.equation.screening import Screened
+from sb3_hds.sysid.equation.selection import LATE
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point, in_threads
 from sb3_hds.sysid.estimation.shooting import Shots, evenly
@@ -54,46 +56,135 @@ def confirmed_set(
     if not members or not passes(search.ranking.compare(base.kept, start.kept)):
         return [], start
     many = len(members) > _MANY
-    verdicts: dict[str, Comparison] = {}
-    lost: dict[str, Base] = {}
-    if many:
-        verdicts = _each_left_out(search, screened, start, base, members, list(members))
-        harmful = {key for key, v in verdicts.items() if v.p_value >= 1.0 - _LEVEL}
-        if harmful:
-            screened = screened.without(harmful)
-            members = _members(search, screened)
-            theta = _sizes_with(search, screened, start, members.keys())
-            base = search.base(theta, base.free, near=base)
-            new = [key for key in members if key not in verdicts]
-            verdicts |= _each_left_out(search, screened, start, base, members, new)
-    while members and not many:
+    judged = (_judge_many if many else _judge_few)(search, screened, start, base)
+    screened, base, members = judged.screened, judged.base, _members(search, judged.screened)
+    p, every = screened.problem, [m.item for m in screened.members]
+    carried = dict(zip(every, map(float, p.force_shares(every)), strict=True))
+    found = [
+        _accepted(search, *members[key], members, judged, key)._replace(
+            share=carried[members[key][1].item],
+            sizes=screened.intervals_of(members[key][1]),
+            of_equation=many,
+            doubts=screened.doubts_of(members[key][1]),
+        )
+        for key in members
+        if key in judged.verdicts
+    ]
+    return found, base
+
+
+class _Judged(NamedTuple):
+    """
+    A set that simulation has judged.
+
+    :param screened: with the members that are left
+    :param base: the model with them
+    :param verdicts: by key of a member, the set beside the one without it
+    :param rivals: by key of a member of a small set, what was fitted in its place
+    """
+
+    screened: Screened
+    base: Base
+    verdicts: Mapping[str, Comparison]
+    rivals: Mapping[str, Sequence[Tried]]
+
+
+def _judge_few(search: Search, screened: Screened, start: Base, base: Base) -> _Judged:
+    """
+    Leave out members that held-out recordings do not need, one after the other, and exchange those
+    in whose place another candidate predicts surely better.
+    """
+    exchanged: set[str] = set()
+    members = _members(search, screened)
+    while True:
         lost = _without_each(search, base, members)
         verdicts = {
             key: _at_own_joint(search.confirm, members[key][0], base.kept, rest.kept)
             for key, rest in lost.items()
         }
         weak = [k for k, v in verdicts.items() if v.p_value >= _LEVEL or v.gain < LEAST_GAIN]
-        if not weak:
-            break
-        worst: str = max(weak, key=lambda key: (verdicts[key].p_value, -verdicts[key].gain))
-        members.pop(worst)
-        base = lost[worst]
-    if len(members) < len(screened.members):
-        screened = screened.among(members)
+        if weak:
+            worst = max(weak, key=lambda key: (verdicts[key].p_value, -verdicts[key].gain))
+            members.pop(worst)
+            base = lost[worst]
+            continue
+        if len(members) < len(screened.members):
+            screened = screened.among(members)
+            members = _members(search, screened)
+        rivals = {
+            key: _rivals(search, screened, start, base, key, without)
+            for key, without in lost.items()
+            if key in members
+        }
+        better = [
+            (key, t)
+            for key, fitted in rivals.items()
+            for t in fitted
+            if t.candidate.key not in exchanged
+            and len(t.candidate.parameters) <= len(members[key][0].parameters)
+            and not as_good(search.ranking.compare(t.kept, base.kept))
+        ]
+        judged = _Judged(screened, base, verdicts, rivals)
+        if not better:
+            return judged
+        key, best = max(better, key=lambda pair: pair[1].criterion)
+        exchanged |= {key, best.candidate.key}
+        screened = screened.with_other(key, best.candidate.key)
+        if best.candidate.key not in (m.key for m in screened.members):
+            return judged
         members = _members(search, screened)
-    p, every = screened.problem, [m.item for m in screened.members]
-    carried = dict(zip(every, map(float, p.force_shares(every)), strict=True))
-    found = [
-        _accepted(search, candidate, member, members, verdicts[key], base, lost.get(key))._replace(
-            share=carried[member.item],
-            sizes=screened.intervals_of(member),
-            of_equation=many,
-            doubts=screened.doubts_of(member),
-        )
-        for key, (candidate, member) in members.items()
-        if key in verdicts
-    ]
-    return found, base
+        base = search.believing(best, lost[key])
+
+
+def _judge_many(search: Search, screened: Screened, start: Base, base: Base) -> _Judged:
+    """Replace members that surely make held-out predictions worse by simpler ones, or none."""
+    members = _members(search, screened)
+    verdicts = _each_left_out(search, screened, start, base, members, list(members))
+    harmful = {key for key, v in verdicts.items() if v.p_value >= 1.0 - _LEVEL}
+    if harmful:
+        screened = screened.without(harmful)
+        members = _members(search, screened)
+        theta = _sizes_with(search, screened, start, members.keys())
+        base = search.base(theta, base.free, near=base)
+        new = [key for key in members if key not in verdicts]
+        verdicts |= _each_left_out(search, screened, start, base, members, new)
+    return _Judged(screened, base, verdicts, {})
+
+
+def _rivals(
+    search: Search, screened: Screened, start: Base, base: Base, key: str, lost: Base
+) -> list[Tried]:
+    """
+    :param lost: the model without a member
+    :return: candidates in its place, fitted from their sizes in the equation of motion: those that
+        predict as well there, and of what makes commands late the other kind, which differs from it
+        by what the equation hardly shows
+    """
+    members = _members(search, screened)
+    candidate, member = members[key]
+    others = dict.fromkeys(member.others)
+    if candidate.name in LATE:
+        others |= dict.fromkeys(f"{name}.{candidate.place}" for name in LATE)
+    known = {c.key: c for c in search.hypotheses.candidates if c.key not in members}
+    rivals = [known[other] for other in others if other in known]
+    rest = [k for k in members if k != key]
+    places = {}
+    for rival in rivals:
+        starts = [_sizes_with(search, screened, start, [*rest, rival.key])]
+        if candidate.name in LATE and rival.name in LATE:
+            starts.append(_as_late(search, base.point.theta, candidate, rival))
+        cost_at = lambda theta: search.select.evidence.nearest(theta, [base.point.offsets])[1]  # noqa: E731
+        places[rival.key] = Place(min(starts, key=cost_at), base.point.offsets, lost.free)
+    return search.fit(rivals, lost, places) if rivals else []
+
+
+def _as_late(search: Search, theta: np.ndarray, one: Candidate, other: Candidate) -> np.ndarray:
+    """A delay and a lag by the same time are the same to first order."""
+    h, theta = search.hypotheses, theta.copy()
+    (here,), (there,) = h.indices(one), h.indices(other)
+    late = np.clip(theta[here], h.lower[there], h.upper[there])
+    theta[here], theta[there] = h.null[here], late
+    return theta
 
 
 def _without_each(
@@ -136,9 +227,7 @@ def _each_left_out(
     return dict(zip(keys, found, strict=True))
 
 
-def _sizes_with(
-    search: Search, screened: Screened, start: Base, keys: Collection[str]
-) -> np.ndarray:
+def _sizes_with(search: Search, screened: Screened, start: Base, keys: Iterable[str]) -> np.ndarray:
     """What is believed with these members only, with their sizes in the equation of motion."""
     return _with_sizes(search, start.point.theta, screened.sizes_of(keys))
 
@@ -157,24 +246,24 @@ def _accepted(
     candidate: Candidate,
     member: Member,
     members: Collection[str],
-    verdict: Comparison,
-    base: Base,
-    lost: Base | None,
+    judged: _Judged,
+    key: str,
 ) -> Accepted:
-    """:param lost: the model without the member"""
-    known = {c.key: c for c in search.hypotheses.candidates}
-    others = [k for k in member.others if k not in members]
-    # Of a large set, what may stand for a member is told as the equation says it.
-    simulated = [known[k] for k in others if k in known]
-    tried = search.fit(simulated, lost) if lost and simulated else []
+    tried, base = judged.rivals.get(key, ()), judged.base
     worse = {
         t.candidate.key for t in tried if not as_good(search.ranking.compare(base.kept, t.kept))
     }
-    equal = [k for k in others if k not in worse]
-    chance = float(scipy.stats.t.sf(member.t, _FREEDOM)) * len(known)
-    same = Tried(candidate, base.point, base.kept, member.gain)
-    rivals = tuple(t for t in tried if t.candidate.key in equal)
-    return Accepted(same, verdict, tuple(equal), min(chance, 1.0), rivals=rivals)
+    # What is not simulated counts as equivalent where the equation says so.
+    others = dict.fromkeys([*member.others, *(t.candidate.key for t in tried)])
+    equal = [k for k in others if k not in worse and k not in members]
+    chance = float(scipy.stats.t.sf(member.t, _FREEDOM)) * len(search.hypotheses.candidates)
+    return Accepted(
+        Tried(candidate, base.point, base.kept, member.gain),
+        judged.verdicts[key],
+        tuple(equal),
+        min(chance, 1.0),
+        rivals=tuple(t for t in tried if t.candidate.key in equal),
+    )
 
 
 def _at_own_joint(half: Half, candidate: Candidate, new: Point, old: Point) -> Comparison:

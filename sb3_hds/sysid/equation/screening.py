@@ -1,6 +1,6 @@
 """Screening by equation errors: which sets of causes, and which single ones, to simulate."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from sb3_hds.sysid.equation.members import (
     members,
 )
 from sb3_hds.sysid.equation.problem import Problem
-from sb3_hds.sysid.equation.selection import propose
+from sb3_hds.sysid.equation.selection import LATE, propose
 from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.parameters import Belief
@@ -82,15 +82,21 @@ class Screened(NamedTuple):
             rest + [o for i in left_out for o in simpler_items(self.problem, i)[:1]]
         )
 
+    def with_other(self, key: str, other: str) -> "Screened":
+        """:return: the same with another candidate in place of a member"""
+        keys = [other if m.key == key else m.key for m in self.members]
+        return self._with_items(self._items_of(keys))
+
     def _with_items(self, items: Sequence[int]) -> "Screened":
         p = self.problem
         found = enforce_bounds(p, retune(p, [*p.always, *items]))
         return self._replace(members=_members_of(self.hypotheses, p, found))
 
-    def sizes_of(self, keys: Collection[str]) -> dict[str, float]:
-        """:return: values of the parameters of some members, by full name, solved without others"""
-        p, rest = self.problem, [m.item for m in self.members if m.key in keys]
-        items = retune(p, [*p.always, *rest])
+    def sizes_of(self, keys: Iterable[str]) -> dict[str, float]:
+        """:return: by full name, values of the parameters of these causes, solved without others"""
+        p, order = self.problem, [m.key for m in self.members]
+        keys = sorted(keys, key=lambda key: (order.index(key) if key in order else len(order), key))
+        items = retune(p, [*p.always, *self._items_of(keys)])
         value, found = p.solve(items).value, {}
         for item in (p.items[i] for i in items if i not in p.always):
             if set(item.free) <= value.keys():
@@ -120,7 +126,7 @@ class Screened(NamedTuple):
         told = _members_of(self.hypotheses, self.problem, retune(self.problem, items))
         return {m.key: Estimates(self.intervals_of(m), self.doubts_of(m)) for m in told}
 
-    def _items_of(self, keys: Collection[str]) -> list[int]:
+    def _items_of(self, keys: Iterable[str]) -> list[int]:
         at: dict[str, int] = {}
         for i, item in enumerate(self.problem.items):
             at.setdefault(item.key, i)
@@ -224,7 +230,7 @@ def screen(
     if small or len(set_of) < 2:
         keys |= {*(k for m in set_of for k in m.others), *_singles(p), *hints}
         keys |= _without_column(hypotheses, p, moved, where)
-        keys |= _of_one_scale(p, keys)
+        keys |= _of_one_scale(p, keys) | _late_at_the_same_places(p, keys)
     return Screened(
         hypotheses=hypotheses,
         problem=p,
@@ -251,6 +257,13 @@ def _of_one_scale(p: Problem, keys: Collection[str]) -> set[str]:
     return {
         item.key for item in p.items if item.candidate.slot == PARAMETER and item.key in p.slopes
     }
+
+
+def _late_at_the_same_places(p: Problem, keys: Collection[str]) -> set[str]:
+    """Where commands may be late, whatever makes them so."""
+    late = [item.candidate for item in p.items if item.candidate.name in LATE]
+    places = {candidate.place for candidate in late if candidate.key in keys}
+    return {candidate.key for candidate in late if candidate.place in places}
 
 
 def _singles(p: Problem) -> set[str]:
