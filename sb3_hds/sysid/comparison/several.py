@@ -7,10 +7,12 @@ import numpy as np
 import scipy
 
 from sb3_hds.sysid.comparison.halves import NOT_FINITE, Base, Half, Tried
-from sb3_hds.sysid.comparison.held_out import LEAST_GAIN, Comparison, as_good, confirm, passes
+from sb3_hds.sysid.comparison.held_out import Comparison, as_good, confirm, passes
 from sb3_hds.sysid.comparison.search import Place, Search
 from sb3_hds.sysid.diagnosis.findings import Accepted
+from sb3_hds.sysid.equation.confirmation import simpler_items
 from sb3_hds.sysid.equation.members import Member
+from sb3_hds.sysid.equation.plausibility import rarity_of
 from sb3_hds.sysid.equation.screening import Screened
 from sb3_hds.sysid.equation.selection import LATE
 from sb3_hds.sysid.estimation.candidates import Candidate
@@ -20,6 +22,8 @@ from sb3_hds.sysid.motion.joints import encoders
 
 # Level at which each member has to be missed by held-out recordings when it is left out.
 _LEVEL = 0.05
+# Least gain of a member that the equation of motion has confirmed already: less is negligible.
+_LEAST = 0.01
 # Members beyond which a set counts as large: their sizes are those in the equation of motion, and
 # each of them, confirmed there on held-out data, only must not surely make predictions worse.
 _MANY = 6
@@ -94,7 +98,7 @@ def _judge_few(search: Search, screened: Screened, start: Base, base: Base) -> _
     Leave out members that held-out recordings do not need, one after the other, and exchange those
     in whose place another candidate predicts surely better.
     """
-    exchanged: set[str] = set()
+    exchanged: dict[str, str] = {}
     members = _members(search, screened)
     while True:
         lost = _without_each(search, base, members)
@@ -102,7 +106,7 @@ def _judge_few(search: Search, screened: Screened, start: Base, base: Base) -> _
             key: _at_own_joint(search.confirm, members[key][0], base.kept, rest.kept)
             for key, rest in lost.items()
         }
-        weak = [k for k, v in verdicts.items() if v.p_value >= _LEVEL or v.gain < LEAST_GAIN]
+        weak = [k for k, v in verdicts.items() if v.p_value >= _LEVEL or v.gain < _LEAST]
         if weak:
             worst = max(weak, key=lambda key: (verdicts[key].p_value, -verdicts[key].gain))
             members.pop(worst)
@@ -112,7 +116,7 @@ def _judge_few(search: Search, screened: Screened, start: Base, base: Base) -> _
             screened = screened.among(members)
             members = _members(search, screened)
         rivals = {
-            key: _rivals(search, screened, start, base, key, without)
+            key: _rivals(search, screened, start, base, key, without, exchanged)
             for key, without in lost.items()
             if key in members
         }
@@ -120,20 +124,33 @@ def _judge_few(search: Search, screened: Screened, start: Base, base: Base) -> _
             (key, t)
             for key, fitted in rivals.items()
             for t in fitted
-            if t.candidate.key not in exchanged
-            and len(t.candidate.parameters) <= len(members[key][0].parameters)
-            and not as_good(search.ranking.compare(t.kept, base.kept))
+            if t.candidate.key not in {*exchanged, *exchanged.values()}
+            and _preferred(search, t, members[key][0], base)
         ]
         judged = _Judged(screened, base, verdicts, rivals)
         if not better:
             return judged
         key, best = max(better, key=lambda pair: pair[1].criterion)
-        exchanged |= {key, best.candidate.key}
+        exchanged[best.candidate.key] = key
         screened = screened.with_other(key, best.candidate.key)
         if best.candidate.key not in (m.key for m in screened.members):
             return judged
         members = _members(search, screened)
         base = search.believing(best, lost[key])
+
+
+def _preferred(search: Search, rival: Tried, member: Candidate, base: Base) -> bool:
+    """
+    :param base: the model with the member
+    :return: whether a rival without more parameters predicts surely better, or as well with better
+        prior odds
+    """
+    compare, twin = search.ranking.compare, search.hypotheses.believed
+    more = len(rival.candidate.parameters) - len(member.parameters)
+    if more <= 0 and not as_good(compare(rival.kept, base.kept)):
+        return True
+    rarer = rarity_of(rival.candidate, twin) - rarity_of(member, twin)
+    return more <= 0 and rarer < 0.0 and as_good(compare(base.kept, rival.kept))
 
 
 def _judge_many(search: Search, screened: Screened, start: Base, base: Base) -> _Judged:
@@ -152,17 +169,27 @@ def _judge_many(search: Search, screened: Screened, start: Base, base: Base) -> 
 
 
 def _rivals(
-    search: Search, screened: Screened, start: Base, base: Base, key: str, lost: Base
+    search: Search,
+    screened: Screened,
+    start: Base,
+    base: Base,
+    key: str,
+    lost: Base,
+    exchanged: Mapping[str, str],
 ) -> list[Tried]:
     """
-    :param lost: the model without a member
+    :param lost: the model without the member
+    :param exchanged: by key of a member, the one in whose place it is
     :return: candidates in its place, fitted from their sizes in the equation of motion: those that
-        predict as well there, and of what makes commands late the other kind, which differs from it
-        by what the equation hardly shows
+        predict as well there, simpler ones of its family, and of what makes commands late the other
+        kind, which differs from it by what the equation hardly shows
     """
     members = _members(search, screened)
     candidate, member = members[key]
-    others = dict.fromkeys(member.others)
+    simpler = simpler_items(screened.problem, member.item)
+    others = dict.fromkeys([*member.others, *(screened.problem.items[i].key for i in simpler)])
+    if key in exchanged:
+        others[exchanged[key]] = None
     if candidate.name in LATE:
         others |= dict.fromkeys(f"{name}.{candidate.place}" for name in LATE)
     known = {c.key: c for c in search.hypotheses.candidates if c.key not in members}

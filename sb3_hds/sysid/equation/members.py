@@ -9,8 +9,8 @@ import scipy
 from sb3_hds.core import Effect
 from sb3_hds.sysid.equation.confirmation import equivalents, held_out_gain
 from sb3_hds.sysid.equation.plausibility import plausibility
-from sb3_hds.sysid.equation.problem import Problem, Solution
-from sb3_hds.sysid.equation.regression import Equation, Item
+from sb3_hds.sysid.equation.problem import Problem
+from sb3_hds.sysid.equation.regression import Equation, Item, Solution
 
 _CONFIDENCE = 0.9
 # Factor by which intervals are wider than cluster-robust ones: sets are rarely complete, and sizes

@@ -3,53 +3,34 @@ Subset selection on normal equations: coefficients, residuals and penalties of s
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.sysid.equation.plausibility import plausibility
-from sb3_hds.sysid.equation.regression import TINY, Item
+from sb3_hds.sysid.equation.regression import Item, Solution, least_squares
 from sb3_hds.sysid.equation.weak_form import Grams
 from sb3_hds.sysid.estimation.candidates import PARAMETER
 
+# A value close to a node between two pieces of a chain, each a linear approximation, may be outside
+# of both by this share of a piece.
+_BEYOND_NODE = 0.1
 # Variance inflation of a coefficient beyond which columns count as collinear.
 _MOST_INFLATION = 200.0
 # Least share of the logged command or the inertia that counts as left by a set.
 _LEAST_LEFT = 0.02
-_RIDGE = 1e-9
 # Least ratio of sliding to static friction: a steeper drop stands for a curve of another form.
 _LEAST_SLIDING = 0.3
 # Nonlinear parameters that cost as much as coefficients: a speed, a period.
 _HIDDEN = {"stribeck_friction": 1, "concave_friction": 1, "cogging": 1}
+#: effects that multiply commands
+GAINS = ("torque_gain", "directional_gain")
+# Iterations for the product of a gain and what else changes the command.
+_GAIN_STEPS = 3
 # Place of effects that all actuators share.
 SHARED = ("actuator", -1)
-
-
-class Solution(NamedTuple):
-    """
-    :param rss: residual sum of squares, in units of the noise
-    :param free: columns whose coefficients were estimated
-    :param theta: coefficients
-    :param inverse: of their normal matrix
-    :param weights: of all columns in the residual; the last is that of the missing force
-    :param held: columns whose coefficients are at a bound
-    """
-
-    rss: float
-    free: list[int]
-    theta: np.ndarray
-    inverse: np.ndarray
-    weights: np.ndarray
-    held: tuple[int, ...]
-
-    @property
-    def value(self) -> dict[int, float]:
-        """Coefficients by column."""
-        found = dict(zip(self.free, map(float, self.theta), strict=True))
-        return found | {c: -float(self.weights[c]) for c in self.held}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -159,15 +140,44 @@ class Problem:
     def solve(self, keys: Sequence[int], total: np.ndarray | None = None) -> Solution:
         """
         Least squares within bounds: coefficients out of bounds are fixed there, the farthest first.
+        What a chain does to a command is multiplied by its gain, which is found by iteration.
 
         :param total: normal equations; default: those of all data
         """
+        gains: dict[int, float] = {}
+        found = self._solve(keys, total, gains)
+        amplified = self._amplified(keys)
+        for _ in range(_GAIN_STEPS if amplified else 0):
+            value = found.value
+            for columns, changed in amplified:
+                change = np.mean([value.get(c, 0.0) for c in changed])
+                gains |= dict.fromkeys(columns, max(1.0 + float(change), _LEAST_LEFT))
+            found = self._solve(keys, total, gains)
+        return found._replace(gains=gains)
+
+    def _amplified(self, keys: Sequence[int]) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+        """:return: columns of a chain, and those of the gain of the same actuator"""
+        chains = [i for i in keys if self.items[i].rule == "chain"]
+        if not chains:
+            return []
+        gains = {self.place(i): i for i in keys if self.items[i].candidate.name in GAINS}
+        return [
+            (self.items[i].columns, self.items[gains[self.place(i)]].columns)
+            for i in chains
+            if self.place(i) in gains
+        ]
+
+    def _solve(
+        self, keys: Sequence[int], total: np.ndarray | None, gains: Mapping[int, float]
+    ) -> Solution:
         gram = self.total if total is None else total
         items = [self.items[i] for i in keys]
         free = [c for item in items for c in item.free]
         weights = np.zeros(len(gram))
         weights[-1] = 1.0
-        weights[[item.columns[0] for item in items if item.rule == "chain"]] = -1.0
+        for item in items:
+            if item.rule == "chain":
+                weights[item.columns[0]] = -gains.get(item.columns[0], 1.0)
         own = np.array([*dict.fromkeys(c for item in items for c in item.columns), len(gram) - 1])
         local = gram[own[:, None], own]
         at = {int(c): k for k, c in enumerate(own)}
@@ -175,11 +185,11 @@ class Problem:
         held: list[int] = []
         while True:
             inside = [at[c] for c in free]
-            theta, inverse = self._least_squares(local, weights[own], inside, self.prior[free])
+            theta, inverse = least_squares(local, weights[own], inside, self.prior[free])
             if inverse is None:
                 return Solution(np.inf, free, theta, np.zeros((len(free),) * 2), weights, ())
             if not held and (common := self._aliased_nuisance(keys, free, inverse)):
-                return self.solve([i for i in keys if i not in common], total)
+                return self._solve([i for i in keys if i not in common], total, gains)
             beyond = np.maximum(self.lower[free] - theta, theta - self.upper[free])
             beyond = np.where([c in bounded for c in free], beyond, -np.inf)
             beyond = beyond * np.sqrt(np.maximum(self.diagonal[free], 0.0))
@@ -192,27 +202,6 @@ class Problem:
         weights[free] = -theta
         rss = float(weights[own] @ local @ weights[own])
         return Solution(rss, free, theta, inverse, weights, tuple(held))
-
-    @staticmethod
-    def _least_squares(
-        gram: np.ndarray, weights: np.ndarray, free: list[int], prior: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """:return: coefficients, and the inverse of their normal matrix; None if there is none"""
-        if not free:
-            return np.zeros(0), np.zeros((0, 0))
-        fixed = weights.copy()
-        fixed[free] = 0.0
-        inner = gram[np.ix_(free, free)] + np.diag(prior)
-        size = np.sqrt(np.diag(inner)) + TINY
-        scaled = inner / np.outer(size, size) + _RIDGE * np.eye(len(free))
-        try:
-            inverse = np.linalg.inv(scaled)
-        except np.linalg.LinAlgError:
-            return np.zeros(len(free)), None
-        theta = inverse @ ((gram[free] @ fixed) / size) / size
-        if not np.isfinite(theta).all():
-            return np.zeros(len(free)), None
-        return theta, inverse / np.outer(size, size)
 
     def _aliased_nuisance(
         self, keys: Sequence[int], free: Sequence[int], inverse: np.ndarray
@@ -256,7 +245,8 @@ class Problem:
             return True
         if item.rule == "chain":
             (c,) = item.free
-            return self.least.get(i, 0.0) <= value[c] <= 1.0
+            least = self.least.get(i, -_BEYOND_NODE)
+            return least <= value[c] <= 1.0 + _BEYOND_NODE
         if item.rule == "blend":
             one, two = (value[c] for c in item.free)
             low, high = self.rests.get(i, (-np.inf, np.inf))
@@ -310,7 +300,7 @@ class Problem:
             item = self.items[i]
             if i in self.passes:
                 out[self.joints(i)] += 2.0 * np.log(max(self.passes[i], _LEAST_LEFT))
-            elif item.candidate.name in ("torque_gain", "directional_gain"):
+            elif item.candidate.name in GAINS:
                 changes = [value[c] for c in item.free if c in value]
                 left = max(1.0 + min(changes), _LEAST_LEFT)
                 out[self.joints(i)] += 2.0 * min(0.0, np.log(left))

@@ -16,7 +16,58 @@ TINY = 1e-100
 # Finite differences by a parameter or a sensor, in shares of its scale.
 STEP = 1e-3
 
+# Added to the diagonal of scaled normal equations.
+_RIDGE = 1e-9
+
 Rule = Literal["linear", "chain", "blend"]
+
+
+class Solution(NamedTuple):
+    """
+    :param rss: residual sum of squares, in units of the noise
+    :param free: columns whose coefficients were estimated
+    :param theta: coefficients
+    :param inverse: of their normal matrix
+    :param weights: of all columns in the residual; the last is that of the missing force
+    :param held: columns whose coefficients are at a bound
+    :param gains: of columns that act on a command, its gain in this set
+    """
+
+    rss: float
+    free: list[int]
+    theta: np.ndarray
+    inverse: np.ndarray
+    weights: np.ndarray
+    held: tuple[int, ...]
+    gains: Mapping[int, float] = {}
+
+    @property
+    def value(self) -> dict[int, float]:
+        """Coefficients by column."""
+        found = dict(zip(self.free, map(float, self.theta), strict=True))
+        found |= {c: -float(self.weights[c]) for c in self.held}
+        return found | {c: found[c] / gain for c, gain in self.gains.items() if c in found}
+
+
+def least_squares(
+    gram: np.ndarray, weights: np.ndarray, free: list[int], prior: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """:return: coefficients, and the inverse of their normal matrix; None if there is none"""
+    if not free:
+        return np.zeros(0), np.zeros((0, 0))
+    fixed = weights.copy()
+    fixed[free] = 0.0
+    inner = gram[np.ix_(free, free)] + np.diag(prior)
+    size = np.sqrt(np.diag(inner)) + TINY
+    scaled = inner / np.outer(size, size) + _RIDGE * np.eye(len(free))
+    try:
+        inverse = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        return np.zeros(len(free)), None
+    theta = inverse @ ((gram[free] @ fixed) / size) / size
+    if not np.isfinite(theta).all():
+        return np.zeros(len(free)), None
+    return theta, inverse / np.outer(size, size)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ from sb3_hds.sysid.equation.members import (
     friction_curves,
     members,
 )
-from sb3_hds.sysid.equation.problem import Problem
+from sb3_hds.sysid.equation.problem import GAINS, Problem
 from sb3_hds.sysid.equation.selection import LATE, propose
 from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
@@ -252,7 +252,7 @@ def _members_of(h: Hypotheses, p: Problem, items: Sequence[int]) -> tuple[Member
 def _of_one_scale(p: Problem, keys: Collection[str]) -> set[str]:
     """Where a gain is tried, the masses: the equation is homogeneous in both together."""
     names = {key.partition(".")[0] for key in keys}
-    if not names & {"torque_gain", "directional_gain"}:
+    if not names & {*GAINS}:
         return set()
     return {
         item.key for item in p.items if item.candidate.slot == PARAMETER and item.key in p.slopes

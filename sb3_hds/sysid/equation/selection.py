@@ -1,5 +1,6 @@
 """Subset selection: a local search over sets of causes, confirmed on held-out data."""
 
+import itertools
 from collections.abc import Collection
 
 import numpy as np
@@ -8,6 +9,7 @@ from sb3_hds.sysid.equation.confirmation import (
     drop_negligible,
     drop_unconfirmed,
     prefer_plausible,
+    retune,
     simplify,
     split_hints,
     substitutes,
@@ -76,7 +78,7 @@ def _climb(p: Problem, keys: list[int], barred: Collection[int] = ()) -> tuple[f
     """:param barred: items that no set may have"""
     score = p.score(keys)
     for _ in range(_MOST_MOVES):
-        for move in (_add_or_drop, _swap, _at_all_joints):
+        for move in (_add_or_drop, _swap, _one_for_two, _at_all_joints):
             tried = [
                 (p.score(t), t)
                 for t in move(p, keys)
@@ -103,6 +105,20 @@ def _swap(p: Problem, keys: list[int]) -> list[list[int]]:
     for i in (i for i in keys if i not in p.always):
         rest = [m for m in keys if m != i]
         trials += [[*rest, o] for o in p.ranking(rest, substitutes(p, keys, i))[:_SWAPPED]]
+    return trials
+
+
+def _one_for_two(p: Problem, keys: list[int]) -> list[list[int]]:
+    """
+    One candidate in place of two parameters of the twin: a mass for a first moment and an inertia,
+    a gain for two masses.
+    """
+    trials = []
+    own = [i for i in keys if i not in p.always and p.items[i].candidate.slot == PARAMETER]
+    for one, other in itertools.combinations(own, 2):
+        rest = [m for m in keys if m not in (one, other)]
+        common = [o for o in substitutes(p, keys, one) if o in set(substitutes(p, keys, other))]
+        trials += [retune(p, [*rest, o]) for o in p.ranking(rest, common)[:_SWAPPED]]
     return trials
 
 
