@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import servo_leg
+from measuring import measured
 
 from sb3_hds import Trajectories, diagnose, effects, twins
 from sb3_hds.core import rollout
@@ -185,13 +186,18 @@ def test_where_the_model_brakes_a_force_counts_the_more_the_later_it_acts(brakin
     assert found[0, -1] / found[0, 0] == pytest.approx(np.exp(braking), rel=1e-4)
 
 
+def waves(dt, size=6.0):
+    """:return: four commands of 600 steps, sums of three sines of 0.3 to 2 Hz"""
+    rng, t = np.random.default_rng(0), dt * np.arange(600)
+    angles = 2.0 * np.pi * rng.uniform(0.3, 2.0, (4, 1, 3)) * t[:, None]
+    return size * np.sin(angles + rng.uniform(0.0, 6.0, (4, 1, 3))).sum(-1)[..., None]
+
+
 @pytest.mark.parametrize("delay, named", [(2e-4, False), (1e-3, True)])
 def test_commands_are_late_from_three_hundredths_of_an_interval(delay, named):
     twin = twins.make("LinearAxis", mass=2.0, damping=3.0, dt=0.01)
     real = twin.extend(effects.ActionDelay(delay=delay).at(0))
-    rng, t = np.random.default_rng(0), 0.01 * np.arange(600)
-    waves = 2.0 * np.pi * rng.uniform(0.3, 2.0, (4, 1, 3)) * t[:, None]
-    commands = 6.0 * np.sin(waves + rng.uniform(0.0, 6.0, (4, 1, 3))).sum(-1)[..., None]
+    rng, commands = np.random.default_rng(0), waves(0.01)
     with jax.enable_x64(True):
         starts = jax.vmap(lambda o: real.infer(o, real.params))(jnp.zeros((4, 2)))
         run = lambda s, a: rollout(real, real.params, s, a).obs  # noqa: E731
@@ -202,6 +208,25 @@ def test_commands_are_late_from_three_hundredths_of_an_interval(delay, named):
 
     late = {"action_delay.force": {"delay": pytest.approx(delay, rel=0.02)}}
     assert found == (late if named else {})
+
+
+@pytest.mark.parametrize("lag", [0.02, 0.04, 0.045])
+def test_a_gain_multiplies_commands_that_are_late(lag):
+    twin = twins.make("LinearAxis", mass=2.0, damping=3.0, dt=0.01)
+    real = twin.extend(
+        effects.TorqueGain(gain=1.5).at(0),
+        effects.MotorLag(time_constant=lag).at(0),
+        effects.ViscousFriction(b=4.0).at(0),
+    )
+    data = measured(real, n=4, noise=1e-4, commands=waves(0.01))
+    found = screen(twin, motion(twin, data), effects.ALL, ())
+
+    sizes = found.sizes_of(["viscous_friction.axis", "torque_gain.force", "motor_lag.force"])
+    assert sizes == {
+        "viscous_friction.axis.b": pytest.approx(4.0, rel=0.05),
+        "torque_gain.force.gain": pytest.approx(1.5, rel=0.03),
+        "motor_lag.force.time_constant": pytest.approx(lag, rel=0.1),
+    }
 
 
 @pytest.mark.parametrize("believed, calibrate", [(5.0, []), (8.0, ["mass"])])

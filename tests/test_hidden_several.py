@@ -1,9 +1,11 @@
 """Several hidden causes: how cases are drawn, driven and scored, and the answers of others."""
 
 import dataclasses
+import json
 
 import first_users
 import hidden_cases
+import hidden_effects
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -13,12 +15,14 @@ import several_rules
 from cases import each
 from hidden_cases import RIGS, kind_of, nominal_twin, nothing
 from independent_rigs import EVERYWHERE, Loop, Planted, modelled
+from measuring import jumping, measured
 from several_cases import SEVERAL, share_of_friction, visible
 from several_scores import score_case
 
 from sb3_hds import effects
 from sb3_hds.sysid.checks.timing import match_logged_integrator
 from sb3_hds.sysid.equation.screening import screen
+from sb3_hds.sysid.equation.selection import _one_for_two
 from sb3_hds.sysid.motion.motion import motion
 
 VISCOUS, DRY = "viscous_friction.axis", "coulomb_friction.axis"
@@ -142,3 +146,32 @@ def test_rules_keep_what_is_in_the_data_and_leave_what_is_not(rule):
 
     assert {*rule(several_rules.Regression(missing, columns, keys))} == {"a", "b"}
     assert rule(several_rules.Regression(0.0 * missing, columns, keys)) == []
+
+
+def test_one_mass_takes_the_place_of_a_moment_and_an_inertia():
+    twin = nominal_twin("pendulum")
+    real = twin.with_parameters(mass=0.8 * twin.values["mass"])
+    data = measured(real, n=4, noise=1e-4, commands=jumping(4, n_levels=30, size=0.3))
+    p = screen(twin, motion(twin, data), effects.ALL, ()).problem
+    named = {item.key: i for i, item in enumerate(p.items)}
+    both = [named["parameter.com"], named["parameter.inertia"]]
+
+    one = [named["parameter.mass"]]
+    assert one in _one_for_two(p, both)
+    assert p.score(one) < p.score(both) < np.inf
+
+
+@pytest.mark.expensive
+@pytest.mark.parametrize(
+    "system, case, named",
+    [
+        # Commands are 40 ms late, which the equation of motion takes for a lag.
+        ("pendulum", 24, {"parameter.mass", "action_delay.motor"}),
+        # It takes a gain of 0.77 for a scale of the encoder, read without velocities.
+        ("pendulum", 58, {"quadratic_drag.hinge", "coulomb_friction.hinge", "torque_gain.motor"}),
+    ],
+)
+def test_simulation_exchanges_a_cause_that_the_equation_of_motion_got_wrong(system, case, named):
+    row = hidden_effects.run(system, case, "quick", rules=False)
+
+    assert {names[0] for names in json.loads(row["sets"])} == named
