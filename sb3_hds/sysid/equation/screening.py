@@ -230,7 +230,7 @@ def screen(
     if small or len(set_of) < 2:
         keys |= {*(k for m in set_of for k in m.others), *_singles(p), *hints}
         keys |= _without_column(hypotheses, p, moved, where)
-        keys |= _of_one_scale(p, keys) | _late_at_the_same_places(p, keys)
+        keys |= _of_one_scale(p, keys, [m.key for m in set_of]) | _late_at_the_same_places(p, keys)
     return Screened(
         hypotheses=hypotheses,
         problem=p,
@@ -249,14 +249,18 @@ def _members_of(h: Hypotheses, p: Problem, items: Sequence[int]) -> tuple[Member
     return tuple(m for m in found if m.item not in p.always)
 
 
-def _of_one_scale(p: Problem, keys: Collection[str]) -> set[str]:
-    """Where a gain is tried, the masses: the equation is homogeneous in both together."""
-    names = {key.partition(".")[0] for key in keys}
-    if not names & {*GAINS}:
-        return set()
-    return {
-        item.key for item in p.items if item.candidate.slot == PARAMETER and item.key in p.slopes
-    }
+def _of_one_scale(p: Problem, keys: Collection[str], members: Collection[str]) -> set[str]:
+    """
+    :param keys: of the candidates to simulate
+    :param members: of these, those of the set
+    :return: masses where a gain or the scale of a sensor is tried, and gains where one of these or
+        a mass is named: the equation is homogeneous in all of them together
+    """
+    masses = {i.key for i in p.items if i.candidate.slot == PARAMETER and i.key in p.slopes}
+    gains = {i.key for i in p.items if i.candidate.name in GAINS}
+    scales = {i.key for i in p.items if i.candidate.name == "sensor_scale"}
+    found = masses if {*keys} & (gains | scales) else set()
+    return found | (gains if {*members} & (masses | scales) else set())
 
 
 def _late_at_the_same_places(p: Problem, keys: Collection[str]) -> set[str]:
