@@ -17,6 +17,8 @@ _CONFIDENCE = 0.9
 # compensate for what is missing. Chosen on other simulated machines than those of
 # benchmarks/hidden_effects.py, which measures the coverage.
 _INCOMPLETE = 2.0
+# Akaike's penalty of a parameter.
+_AKAIKE = 2.0
 # Most sets with one more member that widen intervals, sets that are tried, and sets with an
 # equivalent in place of a member.
 _MORE_SETS, _TRIED_SETS, _SWAPPED = 12, 60, 4
@@ -128,12 +130,16 @@ def _weighed(
 ) -> list[tuple[float, dict[int, float]]]:
     """
     Source: Buckland, Burnham, Augustin, *Model selection: an integral part of inference*,
-    Biometrics 53, 1997: estimates of several models, weighed by an information criterion.
+    Biometrics 53, 1997: estimates of several models, weighed by Akaike's criterion, here with the
+    prior odds. Schwarz's, which chooses the set, gives no weight to causes that are too small to be
+    named, and yet bias the sizes of the others.
 
     :param sets: alternatives to a set
     :return: the weight of each, and its coefficients by column
     """
-    scores = np.array([p.score(keys), *(p.score(each) for each in sets)])
+    scores = np.array(
+        [p.score(s, priced=False) + sum(p.price(i, _AKAIKE) for i in s) for s in (keys, *sets)]
+    )
     if not np.isfinite(scores[0]):
         return []
     weights = np.exp(0.5 * (scores.min() - scores))

@@ -129,13 +129,16 @@ class Problem:
         """Normal equations of all data but one fold."""
         return [self.total - fold.sum(0) for fold in self.grams.folds]
 
-    def price(self, i: int) -> float:
-        """:return: penalty of an item in the criterion: its parameters and its prior odds"""
+    def price(self, i: int, each: float | None = None) -> float:
+        """
+        :param each: of a parameter; default: Schwarz's
+        :return: penalty of an item in the criterion: its parameters and its prior odds
+        """
         if i in self.always:
             return 0.0
         item = self.items[i]
         count = len(item.free) + _HIDDEN.get(item.candidate.name, 0)
-        return count * self.cost + 2.0 * self.rarity[i]
+        return count * (self.cost if each is None else each) + 2.0 * self.rarity[i]
 
     def solve(self, keys: Sequence[int], total: np.ndarray | None = None) -> Solution:
         """
