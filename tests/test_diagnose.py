@@ -24,12 +24,13 @@ from sb3_hds.sysid.diagnosis.findings import (
     contradiction,
     errs_more,
     out_of_reach,
+    verdict_of,
 )
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.shooting import shots_of
-from sb3_hds.sysid.reporting.finding import HorizonGain
+from sb3_hds.sysid.reporting.finding import Finding, HorizonGain
 from sb3_hds.sysid.reporting.printed import doubts_in_words, several_in_words
 
 KINDS = ["ViscousFriction", "CoulombFriction", "TorqueGain", "ActionDelay"]
@@ -66,6 +67,25 @@ def test_horizons_at_which_a_named_cause_makes_predictions_worse_are_reported():
     assert errs_more({5: unsure, 10: better}) == []
     (told,) = errs_more({1: worse, 5: unsure, 10: better})
     assert "1 (+20%)" in told and "5" not in told
+
+
+@each(
+    ([], "", "none"),
+    ([], "a force at hinge", "unknown"),
+    ([()], "a force at hinge", "named"),
+    ([("torque_gain.torque",)], "", "ambiguous"),
+    ([(), ("torque_gain.torque",)], "", "named"),
+    ([("a",), (), ()], "", "named"),
+    ([(), ("a",), ("b",)], "", "ambiguous"),
+)
+def test_a_verdict_follows_from_the_causes_and_what_else_may_be_in_their_place(
+    alternatives, unexplained, verdict
+):
+    causes = [
+        Finding("backlash", {"name": "hinge"}, {}, others, 0.0, 0.0, 0.5, "")
+        for others in alternatives
+    ]
+    assert verdict_of(causes, unexplained) == verdict
 
 
 @pytest.fixture(scope="module")

@@ -87,13 +87,13 @@ def confirm(
     signed rank test on windows, which has no tails to fear, counts too, at a much stricter level,
     because windows of one recording are not independent.
     """
-    verdict = compare(new, old, cluster)
+    comparison = compare(new, old, cluster)
     before, after = (np.maximum(errors[cluster >= 0], 1e-300) for errors in (old, new))
     ratio = np.log(before / after)
     if not np.any(ratio):
-        return verdict
+        return comparison
     by_window: Any = scipy.stats.wilcoxon(ratio, alternative="greater")
-    return verdict._replace(p_value=min(verdict.p_value, _STRICTER * float(by_window.pvalue)))
+    return comparison._replace(p_value=min(comparison.p_value, _STRICTER * float(by_window.pvalue)))
 
 
 def by_scores(
@@ -191,8 +191,8 @@ def as_good(better: Comparison) -> bool:
     return better.p_value > _LEVEL_OF_SET or better.gain < _SAME
 
 
-def passes(verdict: Comparison, level: float = LEVEL) -> bool:
-    return verdict.gain >= LEAST_GAIN and verdict.p_value < level
+def passes(comparison: Comparison, level: float = LEVEL) -> bool:
+    return comparison.gain >= LEAST_GAIN and comparison.p_value < level
 
 
 def information_gain(before: float, after: float, n: float, n_parameters: int) -> float:

@@ -101,13 +101,13 @@ class Ranking(NamedTuple):
 
     def compare_nested(self, new: Point, old: Point) -> Comparison:
         """:return: as :meth:`compare`, of nested models"""
-        verdict = self.compare(new, old)
+        comparison = self.compare(new, old)
         by_score = by_scores(
             new.raw / self.select.evidence.noise,
             old.raw / self.select.evidence.noise,
             self.confirm.cluster,
         )
-        return verdict._replace(p_value=min(verdict.p_value, by_score))
+        return comparison._replace(p_value=min(comparison.p_value, by_score))
 
     def _of_all(self, tried: Tried, base: Base) -> tuple[float, float]:
         """

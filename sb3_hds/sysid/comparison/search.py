@@ -282,12 +282,12 @@ class Search(NamedTuple):
         done = [t.candidate.key for t in tried]
         rest = [c for c in self.hypotheses.candidates if c.key not in done]
 
-        def verdict(candidate: Candidate) -> Comparison:
+        def compared(candidate: Candidate) -> Comparison:
             place = self.places[candidate.key]
             kept = self._kept(place, place.theta, base.kept.offsets, _ROUGH_STEPS)
             return self.ranking.compare_nested(kept, base.kept)
 
-        return list(zip(rest, self._each(verdict, rest), strict=True))
+        return list(zip(rest, self._each(compared, rest), strict=True))
 
     def pairs(
         self, firsts: Sequence[Tried], base: Base, known: Candidate

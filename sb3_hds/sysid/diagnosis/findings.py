@@ -16,6 +16,7 @@ from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.results import Estimate
+from sb3_hds.sysid.reporting.diagnosis import MANY, Verdict
 from sb3_hds.sysid.reporting.finding import Finding, HorizonGain
 from sb3_hds.sysid.reporting.pictures import bounded
 from sb3_hds.sysid.reporting.wording import TOO_LITTLE
@@ -51,7 +52,7 @@ class Accepted(NamedTuple):
     """
 
     tried: Tried
-    verdict: Comparison
+    comparison: Comparison
     alternatives: tuple[str, ...]
     family_p_value: float
     share: float | None = None
@@ -59,6 +60,27 @@ class Accepted(NamedTuple):
     of_equation: bool = False
     doubts: Mapping[str, float] = {}
     rivals: tuple[Tried, ...] = ()
+
+
+def verdict_of(findings: Sequence[Finding], unexplained: str) -> Verdict:
+    """
+    The verdict on data that support one and follow the conventions of the model.
+
+    - ``"named"``: causes are confirmed.
+    - ``"ambiguous"``: they are, but the data cannot tell the first one from its alternatives; of
+      more than ``MANY`` causes, most of them from theirs.
+    - ``"unknown"``: none is, though something can be predicted that the model does not.
+    - ``"none"``: nothing can.
+
+    :param findings: confirmed causes, the first one found first
+    :param unexplained: what no cause explains, in words; empty if nothing is left
+    """
+    if not findings:
+        return "unknown" if unexplained else "none"
+    ambiguous = [bool(one.alternatives) for one in findings]
+    if len(findings) > MANY:
+        return "ambiguous" if 2 * sum(ambiguous) > len(findings) else "named"
+    return "ambiguous" if ambiguous[0] else "named"
 
 
 def finding(
@@ -108,9 +130,9 @@ def finding(
         h.place_of(candidate),
         parameters,
         one.alternatives,
-        one.verdict.p_value,
+        one.comparison.p_value,
         one.family_p_value,
-        one.verdict.gain,
+        one.comparison.gain,
         candidate.explanation,
         one.share,
     )
@@ -219,14 +241,14 @@ def errs_more(gain: Mapping[int, HorizonGain]) -> list[str]:
     ]
 
 
-def why(verdict: Comparison, rejected_for: str | None) -> str:
+def why(comparison: Comparison, rejected_for: str | None) -> str:
     """
-    :param verdict: the comparison of a candidate that is not named
+    :param comparison: the comparison of a candidate that is not named
     :param rejected_for: why it was rejected, if it was ever the best
     """
-    if verdict.gain < LEAST_GAIN:
+    if comparison.gain < LEAST_GAIN:
         return TOO_LITTLE
-    return rejected_for or (CHANCE if verdict.p_value >= LEVEL else "others gain more")
+    return rejected_for or (CHANCE if comparison.p_value >= LEVEL else "others gain more")
 
 
 def bounds_in_words(ends: Sequence[tuple[str, float, float, str]]) -> str:
@@ -287,9 +309,9 @@ def contradiction(weighed: Sequence[tuple[Candidate, Comparison]]) -> str:
         empty
     """
     sure = [
-        (verdict.gain, verdict.p_value, candidate.key)
-        for candidate, verdict in weighed
-        if verdict.gain >= LEAST_GAIN and len(weighed) * verdict.p_value < _CONTRADICTS
+        (comparison.gain, comparison.p_value, candidate.key)
+        for candidate, comparison in weighed
+        if comparison.gain >= LEAST_GAIN and len(weighed) * comparison.p_value < _CONTRADICTS
     ]
     if not sure:
         return ""

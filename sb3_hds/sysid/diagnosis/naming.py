@@ -90,7 +90,7 @@ class Naming:
         if len(found) > 1:
             again = [self._beside_the_others(one, base) for one in found]
             pairs = zip(found, again, strict=True)
-            found = [new if passes(new.verdict) else old for old, new in pairs]
+            found = [new if passes(new.comparison) else old for old, new in pairs]
         return found, base
 
     def pair(
@@ -208,7 +208,7 @@ class Naming:
             [self._accepted(first, firsts, self.start, p_value), second], both
         )
         found = [self._beside_the_others(one, both) for one in found]
-        if len(found) < 2 or not all(passes(one.verdict) for one in found):
+        if len(found) < 2 or not all(passes(one.comparison) for one in found):
             return None
         return found, both
 
@@ -248,9 +248,9 @@ class Naming:
         """:param base: what is believed without it"""
         rivals = [*tried, *self.search.fit_aliased(best, tried, base)]
         others = self.search.ranking.alternatives(best, rivals, base)
-        verdict = self.search.ranking.compare_nested(best.kept, base.kept)
+        comparison = self.search.ranking.compare_nested(best.kept, base.kept)
         fitted = tuple(t for t in rivals if t.candidate.key in others)
-        return Accepted(best, verdict, others, p_value, rivals=fitted)
+        return Accepted(best, comparison, others, p_value, rivals=fitted)
 
     def _beside_the_others(self, one: Accepted, base: Base) -> Accepted:
         """Refit a cause and its alternatives beside all other causes."""

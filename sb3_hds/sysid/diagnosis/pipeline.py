@@ -31,6 +31,7 @@ from sb3_hds.sysid.diagnosis.findings import (
     nameless_in_words,
     out_of_reach,
     to_tell_apart,
+    verdict_of,
     why,
 )
 from sb3_hds.sysid.diagnosis.naming import Naming, keys_of
@@ -41,7 +42,7 @@ from sb3_hds.sysid.equation.screening import Screened
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
 from sb3_hds.sysid.estimation.parameters import Belief, at_limit
-from sb3_hds.sysid.reporting.diagnosis import MANY, Diagnosis
+from sb3_hds.sysid.reporting.diagnosis import Diagnosis
 from sb3_hds.sysid.reporting.finding import Rejected
 from sb3_hds.sysid.reporting.pictures import pictures_of
 
@@ -175,7 +176,7 @@ class Inquiry:
         found, base, force = naming.replaced_by_forces(found, base)
         if force is not None:
             left, nearest = self.residuals.left(base), nameless_in_words(*force, self.hypotheses)
-        beaten = [(c.tried.candidate, c.verdict) for c in confirmed if c not in found]
+        beaten = [(c.tried.candidate, c.comparison) for c in confirmed if c not in found]
         self._set_noise(base.point)
         start, base = map(self.search.refit, (start, base))
         if at_bounds := self._at_bounds(base):
@@ -332,16 +333,9 @@ class Inquiry:
         )
         remains = "" if left.remainder is None else in_words(left.remainder)
         unexplained = " ".join(filter(None, (nearest, remains)))
-        verdict = "none"
-        if findings:
-            open_ = sum(bool(one.alternatives) for one in findings)
-            most = 2 * open_ > len(findings) if len(findings) > MANY else findings[0].alternatives
-            verdict = "ambiguous" if most else "named"
-        elif unexplained:
-            verdict = "unknown"
         gain = by_horizon(confirm, start.kept, base.kept, self.given.every)
         return Diagnosis(
-            verdict=verdict,
+            verdict=verdict_of(findings, unexplained),
             believed=self.believed,
             findings=findings,
             unexplained=unexplained,
