@@ -24,7 +24,7 @@ def test_a_second_answer_is_the_first_whatever_was_asked_in_between(searched):
     start = searched.base(searched.hypotheses.null, ())
     first = searched.finalists(start, [])
 
-    searched.screen(searched.believing(first[0], start), [first[0].candidate.key])
+    searched.fit_roughly(searched.believing(first[0], start), [first[0].candidate.key])
     searched.fit_aliased(first[0], first, start)
     searched.with_noise(10.0 * searched.noise).finalists(start, [])
 

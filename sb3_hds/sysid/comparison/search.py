@@ -93,13 +93,13 @@ class Search(NamedTuple):
         )
         return self._replace(select=select, confirm=confirm)
 
-    def from_places(self, screened: Sequence[Rough], fitted: Sequence[Tried]) -> "Search":
+    def from_places(self, rough: Sequence[Rough], fitted: Sequence[Tried]) -> "Search":
         """
-        :param screened: candidates beside the nominal model
+        :param rough: candidates beside the nominal model
         :param fitted: those of them that were fitted to the end
         :return: a search whose fits begin there
         """
-        places = {rough.candidate.key: rough.place for rough in screened}
+        places = {one.candidate.key: one.place for one in rough}
         for tried in fitted:
             key, point = tried.candidate.key, tried.point
             places[key] = places[key]._replace(theta=point.theta, offsets=point.offsets)
@@ -162,7 +162,7 @@ class Search(NamedTuple):
         offsets = np.concatenate([base.point.offsets, base.kept.offsets])
         return every, every.evidence.fit(base.point.theta, base.free, offsets)
 
-    def screen(self, base: Base, accepted: Sequence[str]) -> list[Rough]:
+    def fit_roughly(self, base: Base, accepted: Sequence[str]) -> list[Rough]:
         """
         :param accepted: keys of candidates that the model contains
         :return: promising candidates, fitted roughly on a sample of windows, best first; then the
@@ -181,7 +181,7 @@ class Search(NamedTuple):
         seen = sorted(seen, key=lambda pair: -pair[0])[: self.effort.guessed]
         likely = [*blind, *(candidate for _, candidate in seen)]
 
-        def fit_roughly(candidate: Candidate) -> Rough:
+        def roughly(candidate: Candidate) -> Rough:
             place, earlier = places[candidate.key], self.places.get(candidate.key)
             blind = place.blind or (earlier is not None and earlier.blind)
             nearby = [place] if earlier is None else [place, earlier]
@@ -193,22 +193,22 @@ class Search(NamedTuple):
             place = place._replace(theta=point.theta, offsets=point.offsets, blind=blind)
             return Rough(candidate, place, point.cost)
 
-        ranked = sorted(self._each(fit_roughly, likely), key=lambda rough: rough.cost)
+        ranked = sorted(self._each(roughly, likely), key=lambda one: one.cost)
         rest = [c for c in left if c not in likely]
         return ranked + [Rough(c, self.places.get(c.key, places[c.key]), np.inf) for c in rest]
 
     def finalists(
-        self, base: Base, accepted: Sequence[str], screened: Sequence[Rough] | None = None
+        self, base: Base, accepted: Sequence[str], rough: Sequence[Rough] | None = None
     ) -> list[Tried]:
         """
         :param accepted: keys of candidates that the model contains
-        :param screened: candidates beside this model, if that was asked already
+        :param rough: candidates beside this model, if they were fitted roughly already
         :return: the most promising candidates, fitted to the end, best first
         """
-        screened = self.screen(base, accepted) if screened is None else screened
-        best = [r for r in screened[: self.effort.finalists] if np.isfinite(r.cost)]
-        near = {rough.candidate.key: rough.place for rough in best}
-        return self.fit([rough.candidate for rough in best], base, near)
+        rough = self.fit_roughly(base, accepted) if rough is None else rough
+        best = [one for one in rough[: self.effort.finalists] if np.isfinite(one.cost)]
+        near = {one.candidate.key: one.place for one in best}
+        return self.fit([one.candidate for one in best], base, near)
 
     def fit(
         self,
