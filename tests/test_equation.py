@@ -305,17 +305,17 @@ def test_velocities_are_compared_with_differences_of_positions():
 
     assert found.scale == pytest.approx([1.03], rel=1e-3)
     assert found.zero == pytest.approx([0.02], rel=0.05)
-    assert found.lag == pytest.approx([-0.5], abs=0.05)
+    assert found.velocity_time == pytest.approx([-0.5], abs=0.05)
     assert not found.agrees[0]
 
 
-@pytest.mark.parametrize("shift", [-0.5, 0.0, 0.2, 0.5])
-def test_differences_of_a_parabola_are_its_slope_when_the_velocity_is_true(shift):
+@pytest.mark.parametrize("velocity_time", [-0.5, 0.0, 0.2, 0.5])
+def test_differences_of_a_parabola_are_its_slope_when_the_velocity_is_true(velocity_time):
     t = 0.1 * np.arange(6.0)
-    found = differences(np.stack([3.0 * t**2, t], 1), 0.1, shift)
+    found = differences(np.stack([3.0 * t**2, t], 1), 0.1, velocity_time)
 
     # At both ends there is one difference only.
-    np.testing.assert_allclose(found[1:-1, 0], 6.0 * (t + 0.1 * shift)[1:-1], atol=1e-12)
+    np.testing.assert_allclose(found[1:-1, 0], 6.0 * (t + 0.1 * velocity_time)[1:-1], atol=1e-12)
     np.testing.assert_allclose(found[:, 1], 1.0)
 
 

@@ -46,7 +46,7 @@ Signals = Sequence[tuple[np.ndarray, np.ndarray]]
 class VelocityShift(Finding):
     """
     :param position: name of the channel whose derivative it is
-    :param samples: delay of the velocity [samples]; negative: early
+    :param samples: delay of the velocity [samples]; negative: it is early
     :param seconds: the same delay [s]
     :param stderr: standard error of ``samples``
     """
@@ -126,7 +126,7 @@ class VelocityPair:
 
     @property
     def samples(self) -> float:
-        """Delay of the velocity [samples]; negative: early."""
+        """Delay [samples]; positive: the velocity was true that long before its position."""
         return self.scores.lag
 
     @functools.cached_property

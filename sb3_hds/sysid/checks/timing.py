@@ -20,7 +20,7 @@ from sb3_hds.core.twin import layers_of
 from sb3_hds.data.audit.results import shifted
 from sb3_hds.data.audit.velocity import VelocityPair, best_pairs, velocity_pairs
 from sb3_hds.sysid.checks.conventions import residual_beside_friction
-from sb3_hds.sysid.motion.joints import encoders, joint_motion, kinematics, lag_of
+from sb3_hds.sysid.motion.joints import encoders, joint_motion, kinematics, velocity_time_of
 from sb3_hds.sysid.motion.motion import motion
 
 # Longest shift that is attributed to computation [samples], [s], and the least that counts.
@@ -43,28 +43,28 @@ def align_velocities(twin: Twin, data: Trajectories) -> tuple[Trajectories, tupl
     :return: the data, and what was changed, in words
     """
     names = [channel.name for channel in twin.channels]
-    measured = [lag for lag in best_pairs(velocity_pairs(data, names)) if _short(lag, data.dt)]
+    measured = [pair for pair in best_pairs(velocity_pairs(data, names)) if _short(pair, data.dt)]
     if not measured:
         return data, ()
     simulated = best_pairs(velocity_pairs(_replayed(twin, data), names))
-    own = {lag.velocity: lag.samples for lag in simulated}
+    own = {pair.velocity: pair.samples for pair in simulated}
     late = {
-        lag: (0.5 if lag.difference.is_backward else lag.samples) - own[lag.velocity]
-        for lag in measured
-        if lag.velocity in own
+        pair: (0.5 if pair.difference.is_backward else pair.samples) - own[pair.velocity]
+        for pair in measured
+        if pair.velocity in own
     }
-    late = {lag: samples for lag, samples in late.items() if abs(samples) > _VISIBLE}
+    late = {pair: samples for pair, samples in late.items() if abs(samples) > _VISIBLE}
     if not late:
         return data, ()
-    words = tuple(_in_words(lag, names[lag.velocity], n, data.dt) for lag, n in late.items())
-    return shifted(data, {lag.velocity: samples for lag, samples in late.items()}), words
+    words = tuple(_in_words(pair, names[pair.velocity], n, data.dt) for pair, n in late.items())
+    return shifted(data, {pair.velocity: samples for pair, samples in late.items()}), words
 
 
-def _in_words(lag: VelocityPair, name: str, samples: float, dt: float) -> str:
+def _in_words(pair: VelocityPair, name: str, samples: float, dt: float) -> str:
     time = f"{1e3 * abs(samples) * dt:.2g} ms ({abs(samples):.2g} samples)"
-    if lag.difference.is_backward:
+    if pair.difference.is_backward:
         return (
-            f"{name} is the backward difference of {lag.position}, and so {time} late; it was "
+            f"{name} is the backward difference of {pair.position}, and so {time} late; it was "
             "moved back. No sensor delays it."
         )
     when = "after" if samples > 0.0 else "before"
@@ -74,11 +74,11 @@ def _in_words(lag: VelocityPair, name: str, samples: float, dt: float) -> str:
     )
 
 
-def _short(lag: VelocityPair, dt: float) -> bool:
-    if lag.difference.is_backward:
+def _short(pair: VelocityPair, dt: float) -> bool:
+    if pair.difference.is_backward:
         return True
-    short = abs(lag.samples) <= _SAMPLES and abs(lag.samples) * dt <= _SECONDS
-    return short and abs(lag.samples) > max(_VISIBLE, _SIGMAS * lag.stderr)
+    short = abs(pair.samples) <= _SAMPLES and abs(pair.samples) * dt <= _SECONDS
+    return short and abs(pair.samples) > max(_VISIBLE, _SIGMAS * pair.stderr)
 
 
 def _replayed(twin: Twin, data: Trajectories) -> Trajectories:
@@ -113,7 +113,7 @@ def match_logged_integrator(
     :return: the twin, the data, and what was changed, in words
     """
     bare = all(isinstance(layer, ExtendedTwin | AnalyticTwin) for layer in layers_of(twin))
-    if lag_of(twin) != 0.0 or not bare:
+    if velocity_time_of(twin) != 0.0 or not bare:
         return twin, data, ()
     channels = [e.velocity for e in encoders(twin).values() if e.velocity is not None]
     if not channels:
@@ -121,8 +121,8 @@ def match_logged_integrator(
     before = motion(twin, data)
     if not before.moves.any() or not before.measured.any():
         return twin, data, ()
-    lag = kinematics(joint_motion(twin, data), data.dt, before.period).lag[before.measured]
-    if np.any(np.abs(lag - _HALF) > _ABOUT):
+    found = kinematics(joint_motion(twin, data), data.dt, before.period)
+    if np.any(np.abs(found.velocity_time[before.measured] - _HALF) > _ABOUT):
         return twin, data, ()
     half = f"{0.5e3 * data.dt:.2g} ms (half a sample) before the positions that they belong to"
     euler = stepping_by(twin, semi_implicit_euler).at_interval(twin.dt, 1)

@@ -139,10 +139,11 @@ def measures_velocity(twin: Twin, data: Trajectories) -> np.ndarray:
     return np.any(np.asarray(speeds), axis=0)
 
 
-def lag_of(twin: Twin) -> float:
+def velocity_time_of(twin: Twin) -> float:
     """
-    :return: when a velocity of the twin is true, in intervals after its position: Euler's rules
-        update one of them with the other from a sub-step before or after
+    :return: when a velocity of the twin is true, in intervals, positive after its position and
+        negative before it (a velocity that is late was true before): Euler's rules update one of
+        them with the other from a sub-step before or after
     """
     integrator = getattr(plant_of(twin), "integrator", None)
     if integrator is semi_implicit_euler:
@@ -151,22 +152,22 @@ def lag_of(twin: Twin) -> float:
 
 
 def differences(
-    q: Float[np.ndarray, "rows dof"], dt: float, shift: float
+    q: Float[np.ndarray, "rows dof"], dt: float, velocity_time: float
 ) -> Float[np.ndarray, "rows dof"]:
     """
-    :param shift: when a velocity is true, between half an interval before its position and half an
-        interval after it
+    :param velocity_time: when a velocity is true, as :func:`velocity_time_of` has it, between -0.5
+        and 0.5
     :return: velocities from differences to the rows before and after
     """
-    return _rates(np.diff(q, axis=0), dt, shift)
+    return _rates(np.diff(q, axis=0), dt, velocity_time)
 
 
-def _rates(ways: np.ndarray, dt: float, shift: float = 0.0) -> np.ndarray:
+def _rates(ways: np.ndarray, dt: float, velocity_time: float = 0.0) -> np.ndarray:
     """Velocities at all rows, from the ways between them, shape ``(..., rows - 1, dof)``."""
     rates = ways / dt
     before = np.concatenate([rates[..., :1, :], rates], -2)
     after = np.concatenate([rates, rates[..., -1:, :]], -2)
-    return (0.5 - shift) * before + (0.5 + shift) * after
+    return (0.5 - velocity_time) * before + (0.5 + velocity_time) * after
 
 
 class Kinematics(NamedTuple):
@@ -175,13 +176,13 @@ class Kinematics(NamedTuple):
 
     :param scale: of the velocity, in units of that of the derivative
     :param zero: of the velocity [rad/s] or [m/s]
-    :param lag: when a velocity is true, in intervals after its position
+    :param velocity_time: when a velocity is true, as :func:`velocity_time_of` has it
     :param agrees: whether scale and zero are right
     """
 
     scale: np.ndarray
     zero: np.ndarray
-    lag: np.ndarray
+    velocity_time: np.ndarray
     agrees: np.ndarray
 
 

@@ -15,8 +15,8 @@ from sb3_hds.sysid.motion.joints import (
     differences,
     joint_motion,
     kinematics,
-    lag_of,
     measures_velocity,
+    velocity_time_of,
 )
 from sb3_hds.sysid.motion.smoothing import Smoothed, smooth
 
@@ -120,13 +120,13 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
     :param twin: reads positions and velocities from observations
     :param data: measured, sampled at the twin's ``dt``
     """
-    shift = lag_of(twin)
+    velocity_time = velocity_time_of(twin)
     actions = [np.asarray(data.episode(i)[1], float) for i in range(len(data))]
     raws = [(*pair, u) for pair, u in zip(joint_motion(twin, data), actions, strict=True)]
     measured = measures_velocity(twin, data)
     expected = _by_the_model(twin, data)
     found = [
-        _smoothed(q, v, measured, data.dt, shift, known)
+        _smoothed(q, v, measured, data.dt, velocity_time, known)
         for (q, v, _), known in zip(raws, expected, strict=True)
     ]
     values = [
@@ -145,10 +145,10 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
         raw = v.copy()
         still = ~measured
         if still.any():
-            raw[:, still] = _differences(q, data.dt, shift, known)[:, still]
+            raw[:, still] = _differences(q, data.dt, velocity_time, known)[:, still]
         recordings.append(_thinned(smoothed, raw, commands, every))
     noise_q, noise_v = mean("noise_q"), mean("noise_v")
-    noise_v = np.where(measured, noise_v, np.sqrt(0.5 + 6.0 * shift**2) * noise_q / data.dt)
+    noise_v = np.where(measured, noise_v, np.sqrt(0.5 + 6.0 * velocity_time**2) * noise_q / data.dt)
     return Motion(
         tuple(recordings),
         np.asarray(data.origin),
@@ -160,7 +160,7 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
         mean("error_v"),
         period,
         np.maximum(np.ceil(0.5 * mean("half") / every), 2.0).astype(int),
-        1.0 if lag_of(twin) == 0.0 else 1.0 - 1.0 / (twin.substeps * every),
+        1.0 if velocity_time == 0.0 else 1.0 - 1.0 / (twin.substeps * every),
         np.array([2.0 * np.pi if joint.unit == "rad" else np.inf for joint in twin.joints]),
         measured & kinematics([(q, v) for q, v, _ in raws], data.dt, period).agrees,
     )
@@ -209,17 +209,17 @@ def _smoothed(
     v: np.ndarray,
     measured: np.ndarray,
     dt: float,
-    shift: float,
+    velocity_time: float,
     expected: _Expected | None,
 ) -> list[Smoothed]:
     """:return: each joint, smoothed relative to the model's prediction where that is less noisy"""
     found = []
     for j in range(q.shape[1]):
-        own = smooth(q[:, j], v[:, j] if measured[j] else None, dt, shift)
+        own = smooth(q[:, j], v[:, j] if measured[j] else None, dt, velocity_time)
         if expected is not None:
             beside = expected[0][:, j], expected[1][:, j]
             left = q[:, j] - beside[0], v[:, j] - beside[1] if measured[j] else None
-            rest = smooth(*left, dt, shift)
+            rest = smooth(*left, dt, velocity_time)
             if rest.noise_q < own.noise_q and rest.noise_v <= own.noise_v:
                 own = rest._replace(
                     q=beside[0] + rest.q,
@@ -230,10 +230,12 @@ def _smoothed(
     return found
 
 
-def _differences(q: np.ndarray, dt: float, shift: float, expected: _Expected | None) -> np.ndarray:
+def _differences(
+    q: np.ndarray, dt: float, velocity_time: float, expected: _Expected | None
+) -> np.ndarray:
     if expected is None:
-        return differences(q, dt, shift)
-    return expected[1] + differences(q - expected[0], dt, shift)
+        return differences(q, dt, velocity_time)
+    return expected[1] + differences(q - expected[0], dt, velocity_time)
 
 
 def _thinned(

@@ -53,13 +53,14 @@ def smooth(
     q: Float[np.ndarray, " rows"],
     v: Float[np.ndarray, " rows"] | None,
     dt: float,
-    shift: float = 0.0,
+    velocity_time: float = 0.0,
 ) -> Smoothed:
     """
     :param q: measured positions
     :param v: measured velocities; None: there are none
     :param dt: sampling interval [s]
-    :param shift: when a velocity is sampled, in intervals after its position
+    :param velocity_time: when a velocity is true, as
+        :func:`~sb3_hds.sysid.motion.joints.velocity_time_of` has it
     """
     least = 1e-12 * (np.ptp(q) + 1e-300)
     noise_q = max(white_noise(q), least)
@@ -69,7 +70,7 @@ def smooth(
     for half in _HALVES:
         if 2 * half + 1 > max(len(q) // 2, 2 * _HALVES[0] + 1) or 2 * half + 1 > len(q):
             break
-        fit = _fitted(q, v, dt, ratio, half, shift)
+        fit = _fitted(q, v, dt, ratio, half, velocity_time)
         if narrowest is None:
             narrowest = max(fit.noise_q, least), max(fit.noise_v, least / dt)
         within = (
@@ -86,7 +87,7 @@ def smooth(
 
 
 def _fitted(
-    q: np.ndarray, v: np.ndarray | None, dt: float, ratio: float, half: int, shift: float
+    q: np.ndarray, v: np.ndarray | None, dt: float, ratio: float, half: int, velocity_time: float
 ) -> Smoothed:
     """The local polynomial of one window width; ``ratio``: weight of velocities times dt."""
     steps, powers = np.arange(-half, half + 1.0), np.arange(_DEGREE + 1)
@@ -95,7 +96,7 @@ def _fitted(
         factor = np.prod([np.maximum(powers - i, 0) for i in range(order)], axis=0)
         return np.where(powers >= order, factor * x[:, None] ** np.maximum(powers - order, 0), 0.0)
 
-    rows = [slope(steps, 0)] + ([] if v is None else [ratio * slope(steps + shift, 1)])
+    rows = [slope(steps, 0)] + ([] if v is None else [ratio * slope(steps + velocity_time, 1)])
     solve = np.linalg.pinv(np.concatenate(rows))
     of_q, of_v = solve[:, : 2 * half + 1], ratio * dt * solve[:, 2 * half + 1 :]
 
@@ -115,7 +116,7 @@ def _fitted(
             out[edge] = slope(place, order) @ c
         return out / dt**order
 
-    place, speed, acceleration = at(0.0, 0), at(shift, 1), at(shift, 2)
+    place, speed, acceleration = at(0.0, 0), at(velocity_time, 1), at(velocity_time, 2)
     inner = slice(half, len(q) - half)
     hat = np.einsum("ij,ji->i", np.concatenate(rows), solve)
     noise_q = np.sqrt(np.mean((q - place)[inner] ** 2) / max(1.0 - hat[half], 0.05))
@@ -123,6 +124,6 @@ def _fitted(
     if v is not None:
         left = max(1.0 - hat[3 * half + 1], 0.05)
         noise_v = float(np.sqrt(np.mean((v - speed)[inner] ** 2) / left))
-    gains = slope(np.array([shift]), 1)[0] / dt
+    gains = slope(np.array([velocity_time]), 1)[0] / dt
     error = np.hypot(np.linalg.norm(gains @ of_q) * noise_q, np.linalg.norm(gains @ of_v) * noise_v)
     return Smoothed(place, speed, acceleration, float(noise_q), noise_v, float(error), half)
