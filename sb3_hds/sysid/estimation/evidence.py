@@ -162,15 +162,18 @@ class Evidence:
         theta = np.array(theta, float)
         offsets = self._measured(theta) if offsets is None else offsets
         now, damping = self._blocks(theta, moving, offsets), _DAMPING
-        null, firm = h.null[moving], (size / h.prior[moving]) ** 2
-        doubt = lambda x: float(0.5 * firm @ ((x[moving] - null) / size) ** 2)  # noqa: E731
+        null, prior_precision = h.null[moving], (size / h.prior[moving]) ** 2
+
+        def prior_cost(x: np.ndarray) -> float:
+            return float(0.5 * prior_precision @ ((x[moving] - null) / size) ** 2)
+
         converged, taken = False, 0
         for _ in range(n_steps):
             taken += 1
             step = eliminate_starts(now, damping)
             new = theta.copy()
-            pull = firm, firm * (theta[moving] - null) / size
-            new[moving] = damped_step(theta[moving], step, pull, size, low, high, damping)
+            prior_terms = prior_precision, prior_precision * (theta[moving] - null) / size
+            new[moving] = damped_step(theta[moving], step, prior_terms, size, low, high, damping)
             z = (new[moving] - theta[moving]) / size
             ahead = offsets + step.from_score + step.from_step @ z
             then = self._blocks(new, moving, ahead)
@@ -185,8 +188,11 @@ class Evidence:
                         for a, b in zip(then, now, strict=True)
                     )
                 )
-            elif gained := max(now.cost.sum() + doubt(theta) - then.cost.sum() - doubt(new), 0.0):
-                theta, offsets, now = new, ahead, then
+            else:
+                lower = now.cost.sum() + prior_cost(theta) - then.cost.sum() - prior_cost(new)
+                gained = max(lower, 0.0)
+                if gained:
+                    theta, offsets, now = new, ahead, then
             damping *= _LESS if gained else _MORE
             far = now.cost.sum() / rival
             if any(taken >= steps and far > ratio for steps, ratio in _HOPELESS):
@@ -194,7 +200,7 @@ class Evidence:
             if (gained and gained < enough * now.cost.sum() + least) or damping > _MOST_DAMPING:
                 converged = True
                 break
-        point = Point(theta, offsets, now.raw, float(now.cost.sum()) + doubt(theta))
+        point = Point(theta, offsets, now.raw, float(now.cost.sum()) + prior_cost(theta))
         return Solution(point, converged, taken)
 
     def slopes(self, point: Point, index: Sequence[int] | None = None) -> Slopes:

@@ -17,15 +17,26 @@ _UNDETERMINED = 100.0
 
 
 class Blocks(NamedTuple):
-    """Normal equations of windows: of start states, of parameters, and between them."""
+    """
+    Cost of windows with its derivatives by start state and parameters, of Gauss-Newton. Leaves have
+    one row for each window.
+
+    :param raw: simulated minus measured, shape ``(n, rows, n_obs)``
+    :param cost: shape ``(n,)``
+    :param start_hessian: shape ``(n, free, free)``
+    :param cross_hessian: by start state and parameters, shape ``(n, free, p)``
+    :param hessian: by parameters in units of their scale, shape ``(n, p, p)``
+    :param start_gradient: shape ``(n, free)``
+    :param gradient: by parameters in units of their scale, shape ``(n, p)``
+    """
 
     raw: np.ndarray
     cost: np.ndarray
-    own: np.ndarray
-    cross: np.ndarray
-    shared: np.ndarray
-    by_start: np.ndarray
-    by_theta: np.ndarray
+    start_hessian: np.ndarray
+    cross_hessian: np.ndarray
+    hessian: np.ndarray
+    start_gradient: np.ndarray
+    gradient: np.ndarray
 
 
 class Step(NamedTuple):
@@ -75,11 +86,11 @@ def normal_equations(
     return Blocks(
         raw=raw,
         cost=cost,
-        own=across @ start,
-        cross=across @ theta,
-        shared=theta.transpose(0, 2, 1) @ theta,
-        by_start=(across @ right)[..., 0],
-        by_theta=(theta.transpose(0, 2, 1) @ right)[..., 0],
+        start_hessian=across @ start,
+        cross_hessian=across @ theta,
+        hessian=theta.transpose(0, 2, 1) @ theta,
+        start_gradient=(across @ right)[..., 0],
+        gradient=(theta.transpose(0, 2, 1) @ right)[..., 0],
     )
 
 
@@ -90,15 +101,16 @@ def eliminate_starts(blocks: Blocks, damping: float) -> Step:
 
     :param damping: Levenberg-Marquardt's, relative to the diagonal
     """
-    free = blocks.own.shape[1]
-    diagonal = np.einsum("nff->nf", blocks.own)
+    free = blocks.start_hessian.shape[1]
+    diagonal = np.einsum("nff->nf", blocks.start_hessian)
     ridge = damping * diagonal + _RIDGE * diagonal.sum(1, keepdims=True) + 1e-300
-    own = blocks.own + ridge[:, :, None] * np.eye(free)
-    solved = np.linalg.solve(own, np.concatenate([blocks.by_start[..., None], blocks.cross], 2))
-    back = blocks.cross.transpose(0, 2, 1)
+    own = blocks.start_hessian + ridge[:, :, None] * np.eye(free)
+    right = np.concatenate([blocks.start_gradient[..., None], blocks.cross_hessian], 2)
+    solved = np.linalg.solve(own, right)
+    back = blocks.cross_hessian.transpose(0, 2, 1)
     return Step(
-        curvature=blocks.shared - back @ solved[..., 1:],
-        scores=blocks.by_theta - (back @ solved[..., :1])[..., 0],
+        curvature=blocks.hessian - back @ solved[..., 1:],
+        scores=blocks.gradient - (back @ solved[..., :1])[..., 0],
         from_score=-solved[..., 0],
         from_step=-solved[..., 1:],
     )
@@ -107,18 +119,18 @@ def eliminate_starts(blocks: Blocks, damping: float) -> Step:
 def damped_step(
     values: np.ndarray,
     step: Step,
-    pull: tuple[np.ndarray, np.ndarray],
+    prior_terms: tuple[np.ndarray, np.ndarray],
     size: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
     damping: float,
 ) -> np.ndarray:
     """
-    :param pull: curvature and slope of the prior
+    :param prior_terms: curvature and slope of the prior
     :return: the parameters after the damped step; those at a bound that would leave it stay
     """
-    curvature = step.curvature.sum(0) + np.diag(pull[0])
-    score = step.scores.sum(0) + pull[1]
+    curvature = step.curvature.sum(0) + np.diag(prior_terms[0])
+    score = step.scores.sum(0) + prior_terms[1]
     free = ~(((values <= low) & (score > 0.0)) | ((values >= high) & (score < 0.0)))
     if not free.any():
         return values
