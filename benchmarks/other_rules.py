@@ -161,7 +161,7 @@ def by_network(inquiry, start) -> Answer:
         [np.cos(missing.position), np.sin(missing.position), missing.velocity, missing.command], 1
     )
     inputs = (inputs - inputs.mean(0)) / (inputs.std(0) + 1e-9)
-    confirm = split(inquiry.given.data, missing.origin, inquiry.seed).confirm
+    held_out = split(inquiry.given.data, missing.origin, inquiry.seed).held_out
     x, y = (torch.tensor(a, dtype=torch.float32) for a in (inputs, weighed(missing)))
     torch.manual_seed(0)
     net = torch.nn.Sequential(
@@ -170,9 +170,9 @@ def by_network(inquiry, start) -> Answer:
     optimiser = torch.optim.Adam(net.parameters(), _RATE, weight_decay=1e-4)
     for _ in range(_N_STEPS):
         optimiser.zero_grad()
-        torch.mean((net(x[~confirm]) - y[~confirm]) ** 2).backward()
+        torch.mean((net(x[~held_out]) - y[~held_out]) ** 2).backward()
         optimiser.step()
     with torch.no_grad():
-        left = torch.sum((net(x[confirm]) - y[confirm]) ** 2)
-    better = bool(left < torch.sum(y[confirm] ** 2))
+        left = torch.sum((net(x[held_out]) - y[held_out]) ** 2)
+    better = bool(left < torch.sum(y[held_out] ** 2))
     return Answer("?", np.nan) if better else Answer()

@@ -12,7 +12,7 @@ from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import Trajectories
 from sb3_hds.sysid.checks.parameter_stability import Change
 from sb3_hds.sysid.comparison.halves import Half
-from sb3_hds.sysid.comparison.held_out import Comparison, compare, confirm, split
+from sb3_hds.sysid.comparison.held_out import Comparison, split, t_or_rank_test, t_test
 from sb3_hds.sysid.comparison.inference import standard_errors
 from sb3_hds.sysid.comparison.ranking import Ranking
 from sb3_hds.sysid.comparison.starts import newton
@@ -265,8 +265,8 @@ def test_both_halves_see_every_condition_and_few_recordings_are_cut_into_stretch
     parts = split(data, np.repeat(np.arange(12), 2), seed=0)
     stretches = split(one, np.zeros(40, int), seed=0).cluster
 
-    assert [parts.confirm[rows].mean() for rows in (slice(8), slice(8, 24))] == [0.5, 0.5]
-    assert all(len(set(parts.confirm[parts.cluster == u])) == 1 for u in range(12))
+    assert [parts.held_out[rows].mean() for rows in (slice(8), slice(8, 24))] == [0.5, 0.5]
+    assert all(len(set(parts.held_out[parts.cluster == u])) == 1 for u in range(12))
     assert len(np.unique(stretches)) == 16 and (np.diff(stretches) >= 0).all()
 
 
@@ -274,7 +274,7 @@ def test_the_gain_is_the_geometric_mean_over_clusters():
     cluster = np.array([0, 0, 1, 1, -1])
     old, new = np.array([1.0, 3.0, 2.0, 2.0, 9.0]), np.array([1.0, 1.0, 1.0, 1.0, 99.0])
 
-    found = compare(new, old, cluster)
+    found = t_test(new, old, cluster)
 
     assert found.gain == pytest.approx(1.0 - 0.5)
     assert found.n_clusters == 2 and found.low <= found.gain <= found.high
@@ -282,7 +282,7 @@ def test_the_gain_is_the_geometric_mean_over_clusters():
 
 # Binomial(1000, rate) is above the last number once in 1000 cases. Of the 5 units' 2.5 %, the test
 # on windows may add a tenth of a percent.
-@each((compare, 8, 0.05, 73), (confirm, 5, 0.025, 43))
+@each((t_test, 8, 0.05, 73), (t_or_rank_test, 5, 0.025, 43))
 def test_a_level_is_kept_where_errors_differ_by_chance(judge, n_units, level, most):
     rng, alarms = np.random.default_rng(0), 0
     unit = np.repeat(np.arange(n_units), 5)
@@ -296,10 +296,10 @@ def test_every_window_may_confirm_where_few_clusters_gain_unequally():
     unit = np.repeat(np.arange(5), 4)
     old, gain = np.full(20, 100.0), np.repeat([1.02, 1.05, 2.0, 50.0, 9000.0], 4)
 
-    assert compare(old / gain, old, unit).p_value > 0.025
-    assert confirm(old / gain, old, unit).p_value < 0.025
-    assert confirm(old, old, unit).p_value > 0.025
-    assert confirm(old * gain, old, unit).p_value > 0.025
+    assert t_test(old / gain, old, unit).p_value > 0.025
+    assert t_or_rank_test(old / gain, old, unit).p_value < 0.025
+    assert t_or_rank_test(old, old, unit).p_value > 0.025
+    assert t_or_rank_test(old * gain, old, unit).p_value > 0.025
 
 
 def tried(name, criterion=60.0):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sb3_hds.sysid.comparison.halves import Half
-from sb3_hds.sysid.comparison.held_out import by_scores, compare
+from sb3_hds.sysid.comparison.held_out import by_scores, t_test
 from sb3_hds.sysid.comparison.inference import standard_errors
 from sb3_hds.sysid.estimation.evidence import Point, Slopes
 
@@ -43,7 +43,7 @@ def test_an_effect_that_recordings_show_unevenly_is_confirmed():
     """Gains between a tenth and nine tenths scatter, but they are no chance."""
     excited = np.repeat([0.6, 1.0, 6.0, 4.0], N_WINDOWS)
     new, old, unit = errors(np.random.default_rng(1), 1.0, guess=0.9, excited=excited)
-    by_gain = compare(*(np.mean(r**2, (1, 2)) for r in (new, old)), unit)
+    by_gain = t_test(*(np.mean(r**2, (1, 2)) for r in (new, old)), unit)
     assert by_gain.gain > 0.3 and by_gain.p_value > 0.025 and by_scores(new, old, unit) < 0.01
 
 

@@ -46,14 +46,14 @@ class Comparison(NamedTuple):
 class Split(NamedTuple):
     """
     :param cluster: cluster of each window, -1 for padding, shape ``(n,)``
-    :param confirm: whether the window is kept from selection, shape ``(n,)``
+    :param held_out: whether the window is kept from selection, shape ``(n,)``
     """
 
     cluster: Int[np.ndarray, " n"]
-    confirm: np.ndarray
+    held_out: np.ndarray
 
 
-def compare(
+def t_test(
     new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], cluster: Int[np.ndarray, " n"]
 ) -> Comparison:
     """
@@ -78,16 +78,16 @@ def compare(
     return Comparison(float(gain), p_value, float(low), float(high), n)
 
 
-def confirm(
+def t_or_rank_test(
     new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], cluster: Int[np.ndarray, " n"]
 ) -> Comparison:
     """
-    As ``compare``, with a second chance. Four or five clusters of which some gain a little and
+    As :func:`t_test`, with a second chance. Four or five clusters of which some gain a little and
     others nearly all are too few for a t test, though every window speaks for the new model: so a
     signed rank test on windows, which has no tails to fear, counts too, at a much stricter level,
     because windows of one recording are not independent.
     """
-    comparison = compare(new, old, cluster)
+    comparison = t_test(new, old, cluster)
     before, after = (np.maximum(errors[cluster >= 0], 1e-300) for errors in (old, new))
     ratio = np.log(before / after)
     if not np.any(ratio):
@@ -150,7 +150,7 @@ def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split
     cluster = origin.copy()
     if len(recordings) < _FEWEST_CLUSTERS:
         cluster = _in_blocks(origin, recordings)
-    rng, confirm = np.random.default_rng(seed), np.zeros(len(origin), bool)
+    rng, held_out = np.random.default_rng(seed), np.zeros(len(origin), bool)
     labels = np.unique(cluster[cluster >= 0])
     condition = {
         label: data.conditions[int(np.flatnonzero(data.origin == origin[cluster == label][0])[0])]
@@ -160,9 +160,9 @@ def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split
     for name in dict.fromkeys(condition.values()):
         own = rng.permutation([label for label in labels if condition[label] == name])
         for label in own:
-            confirm |= (cluster == label) & bool(turn % 2)
+            held_out |= (cluster == label) & bool(turn % 2)
             turn += 1
-    return Split(cluster, confirm)
+    return Split(cluster, held_out)
 
 
 def effective_size(raw: Float[np.ndarray, "n rows obs"]) -> float:

@@ -11,10 +11,10 @@ from sb3_hds.sysid.comparison.held_out import (
     Comparison,
     as_good,
     by_scores,
-    confirm,
     effective_size,
     information_gain,
     passes,
+    t_or_rank_test,
 )
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
@@ -97,7 +97,7 @@ class Ranking(NamedTuple):
     def compare(self, new: Point, old: Point) -> Comparison:
         """:return: comparison of two models on the half that confirms"""
         half = self.confirm
-        return confirm(half.errors(new), half.errors(old), half.cluster)
+        return t_or_rank_test(half.errors(new), half.errors(old), half.cluster)
 
     def compare_nested(self, new: Point, old: Point) -> Comparison:
         """:return: as :meth:`compare`, of nested models"""

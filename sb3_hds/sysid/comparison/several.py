@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 
 from sb3_hds.sysid.comparison.halves import NOT_FINITE, Base, Half, Tried
-from sb3_hds.sysid.comparison.held_out import Comparison, as_good, confirm, passes
+from sb3_hds.sysid.comparison.held_out import Comparison, as_good, passes, t_or_rank_test
 from sb3_hds.sysid.comparison.search import Place, Search
 from sb3_hds.sysid.diagnosis.findings import Accepted
 from sb3_hds.sysid.equation.confirmation import simpler_items
@@ -296,7 +296,7 @@ def _accepted(
 def _at_own_joint(half: Half, candidate: Candidate, new: Point, old: Point) -> Comparison:
     """Held-out errors of the channels of the joint where a cause acts, or of all."""
     channels = own_channels(half, candidate)
-    return confirm(_errors(half, new, channels), _errors(half, old, channels), half.cluster)
+    return t_or_rank_test(_errors(half, new, channels), _errors(half, old, channels), half.cluster)
 
 
 def own_channels(half: Half, candidate: Candidate) -> Sequence[int]:

@@ -262,7 +262,7 @@ def _predicted(quantities: list[np.ndarray], force: np.ndarray, parts: Split) ->
     """Each half of the clusters is predicted from the other."""
     features = _scaled(np.concatenate(quantities, 1))
     guess = np.zeros_like(force)
-    for learn, check in ((~parts.confirm, parts.confirm), (parts.confirm, ~parts.confirm)):
+    for learn, check in ((~parts.held_out, parts.held_out), (parts.held_out, ~parts.held_out)):
         rows = np.flatnonzero(learn)[:_MOST_WINDOWS]
         guess[check] = _ridge(features[rows], force[rows], features[check])
     # Forces are in units of their errors: below one, there is nothing to predict.

@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from sb3_hds.sysid.checks.parameter_stability import Change
 from sb3_hds.sysid.comparison.halves import Base, Half, Tried
-from sb3_hds.sysid.comparison.held_out import LEAST_GAIN, LEVEL, Comparison, compare
+from sb3_hds.sysid.comparison.held_out import LEAST_GAIN, LEVEL, Comparison, t_test
 from sb3_hds.sysid.comparison.inference import aliased_with, profiled, standard_errors
 from sb3_hds.sysid.comparison.unexplained import Remainder
 from sb3_hds.sysid.estimation.candidates import Candidate
@@ -343,7 +343,7 @@ def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int,
             bounded(np.mean((point.raw[:, ahead] / half.evidence.noise) ** 2, 1))
             for point in (before, after)
         )
-        gained = compare(new, old, half.cluster)
+        gained = t_test(new, old, half.cluster)
         rms = [float(np.sqrt(np.mean(errors))) for errors in (old, new)]
         found[ahead * every] = HorizonGain(ahead * every, rms[0], rms[1], gained.low, gained.high)
     return found

@@ -356,7 +356,7 @@ class Inquiry:
                 *self._finer(),
                 *to_tell_apart(found, self.hypotheses),
                 *look_alike([one for one in found if not one.of_equation], select, base),
-                *out_of_reach(confirm, base.kept, self.given.origin[self.given.parts.confirm]),
+                *out_of_reach(confirm, base.kept, self.given.origin[self.given.parts.held_out]),
                 *(errs_more(gain) if findings else ()),
             ),
             twin=self._extended(keys_of(found), point.theta),

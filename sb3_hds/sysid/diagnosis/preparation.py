@@ -140,7 +140,7 @@ class Prepared:
         """Why these data cannot support a verdict; empty if they may."""
         if self.audit.reason:
             return self.audit.reason
-        rows = ~self.parts.confirm, self.parts.confirm
+        rows = ~self.parts.held_out, self.parts.held_out
         clusters = [len(np.unique(self.parts.cluster[own])) for own in rows]
         if min(clusters) < _FEWEST_CLUSTERS // 2:
             return (
@@ -151,7 +151,7 @@ class Prepared:
 
     def halves(self) -> tuple[Half, Half]:
         """:return: the evidence that proposes and the one that confirms, parameters scaled"""
-        rows = ~self.parts.confirm, self.parts.confirm
+        rows = ~self.parts.held_out, self.parts.held_out
         shots = [_rows_of(self.shots, own) for own in rows]
         evidence = Evidence(
             self.hypotheses,
