@@ -302,6 +302,14 @@ def test_a_lag_of_a_fraction_of_a_sample_is_left_alone(lag, seen):
     assert shift == ({"v": pytest.approx(0.01 * lag, abs=2e-4)} if seen else {})
 
 
+@each((90, {}), (130, {"v": pytest.approx(0.01, abs=5e-4)}))
+def test_a_lag_of_data_too_short_to_tell_how_sure_it_is_is_none(n_rows, shift):
+    t = np.arange(float(n_rows))
+    obs = np.stack([np.sin(0.1 * t), 10.0 * np.cos(0.1 * (t - 1.0))], axis=1)
+
+    assert audit(alone(obs), ["q", "v"]).velocity_shift == shift
+
+
 def test_the_noise_of_a_system_that_sometimes_rests_is_measured():
     rng = np.random.default_rng(0)
     sigma = np.array([0.003, 0.05])

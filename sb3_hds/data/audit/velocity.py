@@ -25,7 +25,7 @@ _MOST_ROWS, _STRETCH = 100_000, 10_000  # rows that are compared; longer data: s
 _CLEAR = 0.95  # smallest correlation of a position's derivative with its velocity
 _SAME_SCALE = 0.25  # largest difference of their ratio from 1
 _CIRCLE = 0.1  # largest root mean square of cos^2 + sin^2 - 1
-_BLOCKS = 12
+_BLOCKS, _FEWEST_BLOCKS = 12, 3
 _SHORTEST_SHIFT = 0.75  # samples; half a sample is due to backward differences or Euler steps
 _SIGMAS = 3.0
 _VARIANCE_RATIO = 2.0  # smallest reduction of the unexplained variance by the shift, unless ...
@@ -131,10 +131,13 @@ class VelocityPair:
 
     @functools.cached_property
     def stderr(self) -> float:
-        """Standard error of ``samples``, from the scatter over blocks of the data."""
+        """
+        Standard error of ``samples``, from the scatter over blocks of the data; infinite, since
+        unknown, where these are fewer than three.
+        """
         lags = np.array([s.lag for s in self._block_scores() if s.peak > 0.5 * _CLEAR])
-        if len(lags) < 3:
-            return 0.0 if len(lags) else np.inf
+        if len(lags) < _FEWEST_BLOCKS:
+            return np.inf
         # Robust, because blocks with little motion are inaccurate.
         sigma = 1.4826 * np.median(np.abs(lags - np.median(lags)))
         return float(sigma / np.sqrt(len(lags)))
@@ -151,17 +154,14 @@ class VelocityPair:
 
     def _block_scores(self) -> list["_CrossCorrelation"]:
         """The cross-correlation in parts of the episodes, or in episodes if parts are too short."""
-        n_blocks = max(1, _BLOCKS // len(self.signals))
+        most = max(1, _BLOCKS // len(self.signals))
         reach = len(self.scores.slope) // 2
-        blocks = [
-            block
-            for q, v in self.signals
-            for block in zip(np.array_split(q, n_blocks), np.array_split(v, n_blocks), strict=True)
-            if len(block[0]) > 4 * reach + self.width
-        ]
-        return [
-            _CrossCorrelation.of([b], self.dt, reach, self.width) for b in blocks or self.signals
-        ]
+        least = 4 * reach + self.width + 1
+        blocks = []
+        for q, v in self.signals:
+            n = max(1, min(most, len(q) // least))
+            blocks += zip(np.array_split(q, n), np.array_split(v, n), strict=True)
+        return [_CrossCorrelation.of([block], self.dt, reach, self.width) for block in blocks]
 
 
 def velocity_shifts(pairs: Sequence[VelocityPair]) -> list[VelocityShift]:
