@@ -309,6 +309,21 @@ def test_velocities_are_compared_with_differences_of_positions():
     assert not found.agrees[0]
 
 
+@pytest.mark.parametrize(("scale", "agree"), [(1.0, 20), (1.2, 0)])
+def test_a_single_recording_agrees_with_differences_to_within_its_noise(scale, agree):
+    dt, found = 0.01, []
+    t = dt * np.arange(1001)
+    for seed in range(20):
+        noise = np.random.default_rng(seed).standard_normal((2, 1001, 1)) * [[[0.05]], [[1e-3]]]
+        q, v = (
+            np.sin(2.0 * t)[:, None] + noise[0],
+            scale * 2.0 * np.cos(2.0 * t)[:, None] + noise[1],
+        )
+        found.append(bool(kinematics([(q, v)], dt, np.array([np.pi])).agrees[0]))
+
+    assert sum(found) == pytest.approx(agree, abs=1)
+
+
 @pytest.mark.parametrize("velocity_time", [-0.5, 0.0, 0.2, 0.5])
 def test_differences_of_a_parabola_are_its_slope_when_the_velocity_is_true(velocity_time):
     t = 0.1 * np.arange(6.0)

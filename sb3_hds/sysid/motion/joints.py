@@ -18,6 +18,8 @@ _FEW, _SOME = 5, 50
 # Positions and velocities are compared over this share of a period; they disagree by more than this
 # many standard errors and this share of the speed or scale.
 _PART, _SURE, _SCALE = 0.25, 4.0, 0.005
+# With fewer recordings, about so many stretches of them are the clusters of correlated errors.
+_FEWEST_CLUSTERS, _N_STRETCHES = 8, 16
 # All rows but the last, and all but the first.
 _PAIRS = (slice(None, -1), slice(1, None))
 
@@ -191,7 +193,8 @@ def kinematics(
 ) -> Kinematics:
     """
     Differences of positions over parts of a period, regressed on integrals of the velocity, on the
-    time and on differences of the velocity; errors are clustered by recording.
+    time and on differences of the velocity; errors are clustered by recording, or by stretches of
+    recordings where there are few: the scores of a single cluster add up to nothing.
 
     :param recordings: positions and velocities as measured, each of shape ``(rows, dof)``
     """
@@ -214,10 +217,18 @@ def kinematics(
         size = np.sqrt(np.mean(table**2, 0)) + 1e-300
         inverse = np.linalg.pinv((table / size).T @ (table / size))
         theta[j] = inverse @ (table / size).T @ right / size
-        clusters = [x.T @ (y - x @ theta[j]) / size for x, y in zip(tables, rights, strict=True)]
-        spread = inverse @ sum(np.outer(c, c) for c in clusters) @ inverse
-        n = len(clusters)
-        error = np.sqrt(np.diag(spread) * n / max(n - 1, 1)) / size
+        few = len(tables) < _FEWEST_CLUSTERS
+        scores = [
+            part.sum(0)
+            for x, y in zip(tables, rights, strict=True)
+            for part in _stretches(
+                x * (y - x @ theta[j])[:, None], -(-_N_STRETCHES // len(tables)) if few else 1
+            )
+        ]
+        n = len(scores)
+        by_cluster = np.stack(scores) / size
+        covariance = inverse @ by_cluster.T @ by_cluster @ inverse
+        error = np.sqrt(np.diag(covariance) * n / max(n - 1, 1)) / size
         speed = np.sqrt(np.mean(right**2)) / (steps * dt)
         agrees[j] = abs(theta[j, 0] - 1.0) <= max(_SURE * error[0], _SCALE) and abs(
             theta[j, 1]
@@ -225,3 +236,7 @@ def kinematics(
     return Kinematics(
         1.0 / np.where(theta[:, 0], theta[:, 0], np.inf), -theta[:, 1], -theta[:, 2], agrees
     )
+
+
+def _stretches(rows: np.ndarray, n: int) -> list[np.ndarray]:
+    return [part for part in np.array_split(rows, n) if len(part)]
