@@ -356,6 +356,20 @@ def test_of_what_is_confirmed_all_the_data_choose_but_more_freedom_has_to_be_sur
     assert best.kept == chosen
 
 
+@each((0, "gain"), (1, "tau_c"))
+def test_what_replaces_a_later_cause_is_confirmed_at_the_same_level(n_found, chosen):
+    first, second = tried("tau_c"), tried("gain")
+    ranking = SimpleNamespace(
+        compare_nested=lambda new, _: Comparison(0.5, 0.02, 0.2, 0.7, 6),
+        _of_all=lambda one, _: (0.99, 51.0) if one is second else (1.0, 50.0),
+    )
+    base = SimpleNamespace(kept="base")
+
+    best = Ranking.best_on_pooled_data(ranking, first, [first, second], base, n_found)
+
+    assert best.kept == chosen
+
+
 def test_windows_of_both_halves_count_alike_where_all_the_data_choose():
     rng, noise, unminded = np.random.default_rng(0), np.array([0.1, 0.2]), np.array([0.01, 0.0])
     halves = [Half(SimpleNamespace(noise=noise), np.arange(n), unminded) for n in (5, 8)]

@@ -54,10 +54,13 @@ class Ranking(NamedTuple):
             level *= 0.5
         return None
 
-    def best_on_pooled_data(self, first: Tried, tried: Sequence[Tried], base: Base) -> Tried:
+    def best_on_pooled_data(
+        self, first: Tried, tried: Sequence[Tried], base: Base, n_found: int = 0
+    ) -> Tried:
         """
         :param first: confirmed
         :param tried: it, and what else may be
+        :param n_found: as in :meth:`best`
         :return: of all that are confirmed and have no fewer parameters, the one that both halves
             together prefer; what has more has to be as far ahead as a cause has to be of none
         """
@@ -72,7 +75,7 @@ class Ranking(NamedTuple):
                 ahead > most
                 and not has_more_freedom(first, other)
                 and (surely or not has_more_freedom(other, first))
-                and passes(self.compare_nested(other.kept, base.kept))
+                and passes(self.compare_nested(other.kept, base.kept), LEVEL / (1 + n_found))
             ):
                 best, most = other, ahead
         return best

@@ -238,7 +238,7 @@ class Naming:
         first = self.search.ranking.best(sure, base, n_tests)
         if first is None or not self.by_all:
             return first
-        best = self.search.ranking.best_on_pooled_data(first, sure, base)
+        best = self.search.ranking.best_on_pooled_data(first, sure, base, n_tests)
         self._reranked |= best is not first
         return best
 
