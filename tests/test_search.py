@@ -1,10 +1,14 @@
 """The search for causes by simulation: what it answers depends on nothing that it was asked."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import scipy
 from test_diagnose import TWIN, on_engine
 
 from sb3_hds import effects
+from sb3_hds.sysid.comparison import several
 from sb3_hds.sysid.comparison.search import Place
 from sb3_hds.sysid.diagnosis.findings import Accepted, finding
 from sb3_hds.sysid.diagnosis.pipeline import Inquiry
@@ -73,3 +77,17 @@ def test_intervals_of_several_causes_are_no_narrower_than_models_are_exact(searc
         reach = plain[name].high - plain[name].estimate
         expected = np.hypot(0.0 if of_equation else reach, 0.01 * one.estimate)
         assert one.high - one.estimate == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_member_of_a_set_is_the_best_of_all_candidates_also_of_those_not_simulated():
+    candidate = SimpleNamespace(key="cogging.hinge")
+    member = SimpleNamespace(t=4.0, gain=30.0, others=())
+    screened = SimpleNamespace(hypotheses=SimpleNamespace(candidates=range(40)))
+    base = SimpleNamespace(point=None, kept=None)
+    judged = several._Judged(screened, base, {candidate.key: None}, {})
+    search = SimpleNamespace(hypotheses=SimpleNamespace(candidates=range(5)))
+
+    found = several._accepted(search, candidate, member, [candidate.key], judged, candidate.key)
+
+    # Eight folds.
+    assert found.family_p_value == pytest.approx(40 * scipy.stats.t.sf(4.0, 7))

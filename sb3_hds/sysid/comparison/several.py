@@ -283,12 +283,14 @@ def _accepted(
     # What is not simulated counts as equivalent where the equation says so.
     others = dict.fromkeys([*member.others, *(t.candidate.key for t in tried)])
     equal = [k for k in others if k not in worse and k not in members]
-    chance = float(scipy.stats.t.sf(member.t, _FREEDOM)) * len(search.hypotheses.candidates)
+    # The equation has chosen among all candidates, not only among those that are simulated.
+    n_candidates = len(judged.screened.hypotheses.candidates)
+    p_value = float(scipy.stats.t.sf(member.t, _FREEDOM)) * n_candidates
     return Accepted(
         Tried(candidate, base.point, base.kept, member.gain),
         judged.verdicts[key],
         tuple(equal),
-        min(chance, 1.0),
+        min(p_value, 1.0),
         rivals=tuple(t for t in tried if t.candidate.key in equal),
     )
 
