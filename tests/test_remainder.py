@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from sb3_hds.sysid.comparison.unexplained import _by_chance
+from sb3_hds.sysid.comparison import unexplained
+from sb3_hds.sysid.comparison.held_out import Split
+from sb3_hds.sysid.comparison.unexplained import _by_chance, _predicted
 
 N_SETS, N_UNITS = 11, 8
 
@@ -40,3 +42,14 @@ def test_what_is_met_in_few_recordings_is_seen_in_their_windows():
     found, unit = rng.standard_normal((N_SETS, 8 * 20)), np.repeat(np.arange(8), 20)
     found[5, :60] += 3.0
     assert _by_chance(found, unit)[5] < 0.01
+
+
+def test_of_many_windows_those_that_teach_come_from_all_recordings(monkeypatch):
+    """The first recordings stay at one side, of which the force of the other is not learned."""
+    monkeypatch.setattr(unexplained, "_MOST_WINDOWS", 40)
+    position = np.linspace(-2.0, 2.0, 400)
+    parts = Split(np.arange(400) // 10, np.arange(400) // 10 % 2 > 0)
+
+    found = _predicted([position[:, None]], 3.0 * np.sin(3.0 * position), parts)
+
+    assert found.gain > 0.6

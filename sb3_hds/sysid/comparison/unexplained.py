@@ -263,7 +263,8 @@ def _predicted(quantities: list[np.ndarray], force: np.ndarray, parts: Split) ->
     features = _scaled(np.concatenate(quantities, 1))
     guess = np.zeros_like(force)
     for learn, check in ((~parts.held_out, parts.held_out), (parts.held_out, ~parts.held_out)):
-        rows = np.flatnonzero(learn)[:_MOST_WINDOWS]
+        rows = np.flatnonzero(learn)
+        rows = rows[evenly(len(rows), _MOST_WINDOWS)]
         guess[check] = _ridge(features[rows], force[rows], features[check])
     # Forces are in units of their errors: below one, there is nothing to predict.
     total = max(float(np.sum(force**2)), len(force))
