@@ -49,3 +49,13 @@ def test_large_deviations_are_reported_in_the_unit_of_the_channel_and_as_shares(
     assert [one.near for one in found] == [False, True]
     assert "angle by 0.5 rad, 50% of its standard deviation" in far_in_words(found)
     assert far_in_words(found[1:]) == ""
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_deviations_are_as_large_whatever_the_unit(unit):
+    channels = (Channel("angle", "rad"),)
+    raw = np.full((4, 10, 1), 0.5)
+    raw[0, 5] = np.nan
+    (found,) = distances(channels, unit * raw, unit * np.array([0.01]), unit * np.array([1.0]))
+
+    assert found.error == pytest.approx(unit * np.sqrt((39 * 0.25 + 1e6) / 40))

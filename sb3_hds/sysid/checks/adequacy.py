@@ -11,6 +11,8 @@ from sb3_hds.core import Channel, Trajectories
 # A model predicts to near the noise where its error is below this multiple of it, or below this
 # share of the channel's standard deviation, whichever is larger.
 _NEAR, _SMALL = 3.0, 0.05
+# Larger errors, in standard deviations of the channel, are those of a simulation that diverges.
+_DIVERGED = 1e3
 # Of white noise of one, the standard deviation of fourth differences; a smooth signal has none.
 _FOURTH = np.sqrt(70.0)
 # Standard deviation of normal noise, in units of its median absolute value.
@@ -70,7 +72,9 @@ def distances(
     :param noise: of each channel
     :param deviations: standard deviation of each channel
     """
-    errors = np.sqrt(np.mean(np.minimum(np.nan_to_num(raw**2, nan=np.inf), 1e6), axis=(0, 1)))
+    most = (_DIVERGED * deviations) ** 2
+    squares = np.minimum(np.nan_to_num(raw**2, nan=np.inf, posinf=np.inf), most)
+    errors = np.sqrt(np.mean(squares, axis=(0, 1)))
     return tuple(
         Distance(channel, float(e), float(n), float(s))
         for channel, e, n, s in zip(channels, errors, noise, deviations, strict=True)
