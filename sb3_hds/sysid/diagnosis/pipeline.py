@@ -219,9 +219,8 @@ class Inquiry:
         )
 
     def _least_errors(self) -> np.ndarray:
-        """:return: errors of each channel that nobody minds, or its sensor's noise"""
-        least = np.maximum(IRRELEVANT * self.given.spread, self.given.sensor_noise)
-        return np.maximum(least, IRRELEVANT)
+        """:return: region of practical equivalence of each channel, or its sensor's noise"""
+        return np.maximum(IRRELEVANT * self.given.spread, self.given.sensor_noise)
 
     def wrong_convention(self, convention: Convention) -> Diagnosis:
         """:return: the verdict that the log does not follow the conventions of the model"""
