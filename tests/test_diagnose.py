@@ -9,7 +9,7 @@ from cases import each
 from measuring import jumping, measured
 
 from sb3_hds import diagnose, effects, twins
-from sb3_hds.core import Trajectories
+from sb3_hds.core import Joint, Trajectories
 from sb3_hds.sysid.checks.parameter_stability import Change
 from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import Comparison, split, t_or_rank_test, t_test
@@ -413,7 +413,7 @@ def test_friction_that_changes_with_place_or_time_is_left_over(where, seed):
     )
     data = Trajectories.from_arrays([np.zeros((21, 1))] * 10, [np.zeros((20, 1))] * 10, dt=0.1)
 
-    found = remainder(missing, data, ("hinge",), seed=0)
+    found = remainder(missing, data, (Joint("hinge"),), seed=0)
 
     assert found is not None and {"velocity", where} <= set(found.goes_with)
 

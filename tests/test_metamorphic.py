@@ -18,7 +18,8 @@ import pytest
 from independent_rigs import SYSTEMS, Planted, System, simulate
 
 from sb3_hds import Trajectories, diagnose, effects, twins
-from sb3_hds.core import Channel
+from sb3_hds.core import Channel, Joint
+from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
 from sb3_hds.sysid.equation.screening import screen
 from sb3_hds.sysid.motion.motion import motion
 from sb3_hds.twins.rigs.linear_axis import LinearAxis
@@ -328,6 +329,35 @@ def test_friction_of_two_joints_is_proposed_in_any_order_and_direction(other):
     frictions = {(f"{p.effect}.joint{p.index}", name) for p in TWO_JOINTS for name in p.values}
     assert before.keys() == frictions
     same(before, proposed(changed), changed)
+
+
+@pytest.mark.parametrize("length", [1e-12, 1e3])
+def test_a_residual_force_is_as_predictable_whatever_the_unit_of_length(length):
+    rng, n = np.random.default_rng(0), 200
+    position, velocity = rng.uniform(0.5, 1.5, (2, n, 1))
+    data = Trajectories.from_arrays([np.zeros((21, 1))] * 10, [np.zeros((20, 1))] * 10, dt=0.1)
+
+    force = 3.0 * np.sin(5.0 * position) + rng.standard_normal((n, 1))
+
+    def left(unit):
+        missing = MissingForce(
+            force=force,
+            stderr=np.ones((n, 1)),
+            position=unit * position,
+            velocity=unit * velocity,
+            command=np.zeros((n, 0)),
+            time=np.tile(np.arange(20.0), 10),
+            origin=np.repeat(np.arange(10), 20),
+            numbers=10,
+            noise=np.ones(1),
+        )
+        return remainder(missing, data, (Joint("axis", "m"),), seed=0)
+
+    plain, other = left(1.0), left(length)
+
+    assert plain is not None and "position" in plain.goes_with
+    assert other is not None and other.goes_with == plain.goes_with
+    assert other.gain == pytest.approx(plain.gain, rel=1e-6)
 
 
 def test_numbers_grow_with_their_units():

@@ -1,12 +1,13 @@
 """The residual force that no candidate explains, and what it depends on."""
 
+from collections.abc import Sequence
 from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from sb3_hds.core import Trajectories
+from sb3_hds.core import Joint, Trajectories
 from sb3_hds.sysid.comparison.held_out import Split, split
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, Slopes
 from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
@@ -30,6 +31,8 @@ _STRICTER = 25.0
 # A smaller set of quantities that explains this share of what all explain tells where it lives.
 _MOST_OF_IT = 0.8
 _MOST_RATIO = 4.0
+# What varies by a smaller share of its values is constant.
+_CONSTANT = 1e-9
 
 
 class ShortWindows(NamedTuple):
@@ -183,7 +186,7 @@ def _lengthened(shots: Shots, steps: int) -> Shots:
 def remainder(
     missing: MissingForce,
     data: Trajectories,
-    joints: tuple[str, ...],
+    joints: Sequence[Joint],
     seed: int,
     least_power: float = 0.0,
 ) -> Remainder | None:
@@ -196,19 +199,9 @@ def remainder(
     :return: joint and quantities; None if nothing can be predicted
     """
     parts = split(data, missing.origin, seed)
+    quantities = _quantities(missing, joints)
     found: list[Remainder] = []
     for j, joint in enumerate(joints):
-        quantities = {
-            "position": np.concatenate(
-                [np.cos(missing.position), np.sin(missing.position), missing.position], 1
-            ),
-            "velocity": np.concatenate(
-                [missing.velocity, np.tanh(3.0 * _scaled(missing.velocity))], 1
-            ),
-            "command": missing.command,
-            "time": missing.time[:, None],
-        }
-        quantities = {name: values for name, values in quantities.items() if values.shape[1]}
         force = weighed(missing)[:, j]
         force = np.clip(force, -_MOST_RATIO * force.std(), _MOST_RATIO * force.std())
         told = {
@@ -228,7 +221,7 @@ def remainder(
         power = told[enough].gain * max(float(np.mean(force**2)), 1.0)
         if power < least_power:
             continue
-        found.append(Remainder(joint, enough, told[enough].gain, chance[enough], power))
+        found.append(Remainder(joint.name, enough, told[enough].gain, chance[enough], power))
     return max(found, key=lambda r: r.gain, default=None)
 
 
@@ -239,6 +232,20 @@ def weighed(missing: MissingForce) -> Float[np.ndarray, "n dof"]:
     """
     typical = np.median(missing.stderr, 0)
     return missing.force / missing.stderr * np.minimum(1.0, typical / missing.stderr)
+
+
+def _quantities(missing: MissingForce, joints: Sequence[Joint]) -> dict[str, np.ndarray]:
+    """:return: what a residual force may depend on, by name, each of shape ``(n, k)``"""
+    hinges = np.array([joint.unit == "rad" for joint in joints])
+    # A sine of metres would depend on their unit.
+    angle = np.where(hinges, missing.position, _scaled(missing.position))
+    quantities = {
+        "position": np.concatenate([np.cos(angle), np.sin(angle), missing.position], 1),
+        "velocity": np.concatenate([missing.velocity, np.tanh(3.0 * _scaled(missing.velocity))], 1),
+        "command": missing.command,
+        "time": missing.time[:, None],
+    }
+    return {name: values for name, values in quantities.items() if values.shape[1]}
 
 
 def _together(quantities: dict[str, np.ndarray], names: tuple[str, ...]) -> list[np.ndarray]:
@@ -254,8 +261,9 @@ def _together(quantities: dict[str, np.ndarray], names: tuple[str, ...]) -> list
 
 
 def _scaled(values: np.ndarray) -> np.ndarray:
-    spread = values.std(0)
-    return (values - values.mean(0)) / np.where(spread > 1e-9, spread, 1.0)
+    std = values.std(0)
+    changes = std > _CONSTANT * np.abs(values).max(0, initial=0.0)
+    return (values - values.mean(0)) / np.where(changes, std, 1.0)
 
 
 def _predicted(quantities: list[np.ndarray], force: np.ndarray, parts: Split) -> _Predicted:

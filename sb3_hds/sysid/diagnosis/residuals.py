@@ -65,11 +65,10 @@ class Residuals:
         """:return: what the current model leaves"""
         short = self._short(base.point.theta)
         missing = missing_force(short, self.given.data)
-        joints = tuple(joint.name for joint in self.hypotheses.twin.joints)
         power = float(np.mean(np.sum(weighed(missing) ** 2, 1)))
         mind = float(np.mean((IRRELEVANT * self.given.spread / missing.noise) ** 2))
         least = _OF_IRRELEVANT**2 * mind * missing.numbers
-        found = remainder(missing, self.given.data, joints, self.seed, least)
+        found = remainder(missing, self.given.data, self.hypotheses.twin.joints, self.seed, least)
         # Errors of forces are known better the less is missing: two twins need one unit.
         unit = float(np.mean((missing.noise / self.search.noise) ** 2))
         predicted = 0.0 if found is None else unit * found.power
