@@ -200,28 +200,27 @@ def remainder(
     """
     parts = split(data, missing.origin, seed)
     quantities = _quantities(missing, joints)
+    sets = [names for k in (1, 2, len(quantities)) for names in combinations(quantities, k)]
+    forces = [np.clip(f, -_MOST_RATIO * f.std(), _MOST_RATIO * f.std()) for f in weighed(missing).T]
+    told = [
+        {names: _predicted(_together(quantities, names), force, parts) for names in sets}
+        for force in forces
+    ]
+    agreement = np.array([[one.agreement for one in by_names.values()] for by_names in told])
+    p_values = _by_chance(agreement, parts.cluster)
     found: list[Remainder] = []
-    for j, joint in enumerate(joints):
-        force = weighed(missing)[:, j]
-        force = np.clip(force, -_MOST_RATIO * force.std(), _MOST_RATIO * force.std())
-        told = {
-            names: _predicted(_together(quantities, names), force, parts)
-            for k in (1, 2, len(quantities))
-            for names in combinations(quantities, k)
-        }
-        p_values = _by_chance(np.stack([one.agreement for one in told.values()]), parts.cluster)
-        chance = {
-            name: min(float(p) * len(joints), 1.0) for name, p in zip(told, p_values, strict=True)
-        }
-        best = max(told, key=lambda names: told[names].gain)
-        most = told[best].gain
-        if most < _LEAST_GAIN or chance[best] >= _LEVEL:
+    for joint, force, by_names, p_of_joint in zip(joints, forces, told, p_values, strict=True):
+        p_value = dict(zip(by_names, map(float, p_of_joint), strict=True))
+        best = max(by_names, key=lambda names: by_names[names].gain)
+        most = by_names[best].gain
+        if most < _LEAST_GAIN or p_value[best] >= _LEVEL:
             continue
-        enough = min((names for names in told if told[names].gain >= _MOST_OF_IT * most), key=len)
-        power = told[enough].gain * max(float(np.mean(force**2)), 1.0)
+        enough = min((n for n in by_names if by_names[n].gain >= _MOST_OF_IT * most), key=len)
+        gain = by_names[enough].gain
+        power = gain * max(float(np.mean(force**2)), 1.0)
         if power < least_power:
             continue
-        found.append(Remainder(joint.name, enough, told[enough].gain, chance[enough], power))
+        found.append(Remainder(joint.name, enough, gain, p_value[enough], power))
     return max(found, key=lambda r: r.gain, default=None)
 
 
@@ -281,36 +280,43 @@ def _predicted(quantities: list[np.ndarray], force: np.ndarray, parts: Split) ->
 
 
 def _by_chance(
-    agreement: Float[np.ndarray, "sets n"], cluster: Int[np.ndarray, " n"]
-) -> Float[np.ndarray, " sets"]:
+    agreement: Float[np.ndarray, "joints sets n"], cluster: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "joints sets"]:
     """
-    P-value: how often some set of quantities predicts as well where nothing can be predicted. Then
-    predictions agree in sign with measurements as often as not, whichever the set, so signs are
-    flipped for all sets together: those of whole clusters, because windows of one recording are not
-    independent. What happens in a few recordings only, such as hitting a wall, shows there many
-    times, so flips of single windows count too, at a much stricter level.
+    P-value: how often some set of quantities predicts the force of some joint as well where nothing
+    can be predicted. Then predictions agree in sign with measurements as often as not, whichever
+    the joint and the set, so signs are flipped for all of them together: those of whole clusters,
+    because windows of one recording are not independent. What happens in a few recordings only,
+    such as hitting a wall, shows there many times, so flips of single windows count too, at a much
+    stricter level.
 
     Source: Westfall and Young, *Resampling-based multiple testing*, Wiley 1993 (the largest
     statistic of a family).
 
-    :return: for each set, shape ``(sets,)``
+    :param agreement: predicted times measured, of each window
     """
     by_cluster = np.stack(
-        [agreement[:, cluster == label].sum(1) for label in np.unique(cluster)], 1
+        [agreement[..., cluster == label].sum(-1) for label in np.unique(cluster)], -1
     )
     return np.minimum(_by_flips(by_cluster), _STRICTER * _by_flips(agreement))
 
 
-def _by_flips(agreement: Float[np.ndarray, "sets n"]) -> Float[np.ndarray, " sets"]:
-    n = agreement.shape[1]
+def _by_flips(
+    agreement: Float[np.ndarray, "joints sets n"],
+) -> Float[np.ndarray, "joints sets"]:
+    # Every joint in units of what flips make of its own: none hides the others.
+    size = np.sqrt(np.sum(agreement**2, -1, keepdims=True).max(1, keepdims=True))
+    agreement = agreement / np.where(size > 0.0, size, 1.0)
+    n = agreement.shape[-1]
     if n <= _ALL_SIGNS_OF:
         signs = np.array(list(product((1.0, -1.0), repeat=n)))
     else:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_N_FLIPS, n))
         signs[0] = 1.0
-    largest = np.max(signs @ agreement.T, axis=1)
+    largest = np.max(signs @ agreement.reshape(-1, n).T, axis=1)
     # The first pattern is that of the data themselves.
-    return np.mean(largest[:, None] >= agreement.sum(1) - 1e-9 * np.abs(agreement).sum(1), axis=0)
+    own = agreement.sum(-1) - 1e-9 * np.abs(agreement).sum(-1)
+    return np.mean(largest >= own[..., None], axis=-1)
 
 
 def _ridge(features: np.ndarray, force: np.ndarray, there: np.ndarray) -> np.ndarray:
