@@ -8,7 +8,7 @@ from measuring import jumping, measured
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import JointEffect, Parameter
 from sb3_hds.effects.shapes import dry_friction
-from sb3_hds.sysid.checks.parameter_stability import _tested, _waves
+from sb3_hds.sysid.comparison.parameter_stability import _tested, _waves
 
 N_WINDOWS, N_FITTED = 200, 3
 SIZE = 1

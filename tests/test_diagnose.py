@@ -10,17 +10,16 @@ from measuring import jumping, measured
 
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import Joint, Trajectories
-from sb3_hds.sysid.checks.parameter_stability import Change
 from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import Comparison, split, t_or_rank_test, t_test
-from sb3_hds.sysid.comparison.inference import standard_errors
+from sb3_hds.sysid.comparison.inference import standard_errors, systematic
+from sb3_hds.sysid.comparison.parameter_stability import Change
 from sb3_hds.sysid.comparison.ranking import Ranking
 from sb3_hds.sysid.comparison.starts import newton
 from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
 from sb3_hds.sysid.diagnosis import residuals
 from sb3_hds.sysid.diagnosis.findings import (
     NAMELESS,
-    _systematic,
     contradiction,
     errs_more,
     out_of_reach,
@@ -529,6 +528,6 @@ def test_the_sentence_on_several_causes_summarises_them_by_joint():
 
 
 def test_sizes_of_two_stages_that_differ_make_an_interval_wide():
-    assert _systematic(2.0, None) == _systematic(2.0, (1.5, 1.0, 2.5)) == 0.0
-    assert _systematic(2.0, (1.5, 1.2, 1.8)) == pytest.approx(np.sqrt(0.5**2 - 0.3**2))
-    assert _systematic(1.0, (1.5, 1.2, 1.6)) == pytest.approx(np.sqrt(0.5**2 - 0.3**2))
+    assert systematic(2.0, None) == systematic(2.0, (1.5, 1.0, 2.5)) == 0.0
+    assert systematic(2.0, (1.5, 1.2, 1.8)) == pytest.approx(np.sqrt(0.5**2 - 0.3**2))
+    assert systematic(1.0, (1.5, 1.2, 1.6)) == pytest.approx(np.sqrt(0.5**2 - 0.3**2))

@@ -69,6 +69,26 @@ LATE = {
 TANGLED = {"sysid": 5}
 """How many files of a layer import each other in a circle: to become fewer, never more."""
 
+ROOMS_OF_SYSID = (
+    {"progress", "motion"},
+    {"estimation"},
+    {"equation"},
+    {"checks", "comparison"},
+    {"belief"},
+    {"design"},
+    {"reporting"},
+    {"diagnosis"},
+)
+"""Folders of system identification: each imports those before it."""
+
+UPWARD = {
+    # Results draw themselves, inside methods.
+    ("sb3_hds.sysid.estimation.results", "sb3_hds.sysid.reporting.figures"),
+    ("sb3_hds.sysid.design.result", "sb3_hds.sysid.reporting.figures"),
+    ("sb3_hds.sysid.design.experiment", "sb3_hds.sysid.reporting.wording"),
+}
+"""Imports of a later folder: to become fewer, never more."""
+
 DRAWING = {"figures.py", "film.py", "rendering.py", "report.py"}
 """Files that may import matplotlib, inside functions."""
 
@@ -177,20 +197,42 @@ def test_files_import_to_the_left_and_only_the_libraries_of_their_layers():
     ] == []
 
 
-def test_files_of_a_folder_do_not_import_each_other_in_circles():
-    paths = [path.relative_to(ROOT) for path in ROOT.glob("sb3_hds/**/*.py")]
+def modules_with_imports(pattern: str) -> dict[str, set[str]]:
+    """:return: by module, what it imports"""
+    paths = [path.relative_to(ROOT) for path in ROOT.glob(pattern)]
     modules = {
         ".".join(path.with_suffix("").parts).removesuffix(".__init__"): path.as_posix()
         for path in paths
     }
+    return {module: set(names_in(path, modules)) for module, path in modules.items()}
+
+
+def test_files_of_a_folder_do_not_import_each_other_in_circles():
     imported = {
-        module: {name for name in names_in(path, modules) if (module, name) not in LATE}
-        for module, path in modules.items()
+        module: {name for name in names if (module, name) not in LATE}
+        for module, names in modules_with_imports("sb3_hds/**/*.py").items()
     }
 
     left = Counter(module.split(".")[1] for module in in_circles(imported))
 
     assert left == TANGLED
+
+
+def test_rooms_of_system_identification_import_those_before_them():
+    place = {room: n for n, rooms in enumerate(ROOMS_OF_SYSID) for room in rooms}
+    inside = modules_with_imports("sb3_hds/sysid/*/**/*.py") | {"sb3_hds.sysid.progress": set()}
+
+    def room(module: str) -> str:
+        return module.split(".")[2]
+
+    upward = {
+        (module, name)
+        for module, names in inside.items()
+        for name in names & inside.keys()
+        if place[room(name)] >= place[room(module)] and room(name) != room(module)
+    }
+
+    assert upward == UPWARD
 
 
 def test_circles_are_found_without_what_leads_from_one_to_another():

@@ -9,8 +9,9 @@ from test_diagnose import TWIN, on_engine
 
 from sb3_hds import effects
 from sb3_hds.sysid.comparison import several
+from sb3_hds.sysid.comparison.halves import Accepted
 from sb3_hds.sysid.comparison.search import Place
-from sb3_hds.sysid.diagnosis.findings import Accepted, finding
+from sb3_hds.sysid.diagnosis.findings import finding
 from sb3_hds.sysid.diagnosis.pipeline import Inquiry
 
 KINDS = (effects.ViscousFriction, effects.CoulombFriction, effects.StribeckFriction)

@@ -9,11 +9,10 @@ from jaxtyping import Float
 
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.sysid.belief.answers import Answer, Answers, everything_open, factor_of
-from sb3_hds.sysid.comparison.halves import Base, Half
+from sb3_hds.sysid.comparison.halves import Accepted, Base, Half
 from sb3_hds.sysid.comparison.held_out import effective_size
 from sb3_hds.sysid.comparison.inference import jackknife
 from sb3_hds.sysid.comparison.search import Search, places_of
-from sb3_hds.sysid.diagnosis.findings import Accepted
 from sb3_hds.sysid.equation.plausibility import rarity_of
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point

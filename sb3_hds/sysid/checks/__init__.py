@@ -1,1 +1,1 @@
-"""Checks of a log and a model: conventions, timing, adequacy, and stability of parameters."""
+"""Checks of a log and a model: conventions, timing, adequacy."""

@@ -1,10 +1,12 @@
 """Half of the recordings propose, the others confirm: models and candidates on both halves."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from sb3_hds.sysid.comparison.held_out import Comparison
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point
 
@@ -63,6 +65,32 @@ class Tried(NamedTuple):
     point: Point
     kept: Point
     criterion: float
+
+
+class Accepted(NamedTuple):
+    """
+    A cause that was confirmed.
+
+    :param alternatives: keys of candidates that the data cannot distinguish from it
+    :param family_p_value: family-wise p-value: that the best of all candidates gains as much if
+        nothing is wrong
+    :param share: of the force at its joint that it carries; None where that is not known
+    :param sizes: estimate and interval of the equation of motion by parameter, where there are any
+    :param of_equation: whether these are told, rather than those of a simulation
+    :param doubts: by parameter, half the width of an interval that comes from not knowing whether
+        there is one cause more
+    :param rivals: the alternatives as they were fitted, those that were simulated
+    """
+
+    tried: Tried
+    comparison: Comparison
+    alternatives: tuple[str, ...]
+    family_p_value: float
+    share: float | None = None
+    sizes: Mapping[str, tuple[float, float, float]] = {}
+    of_equation: bool = False
+    doubts: Mapping[str, float] = {}
+    rivals: tuple[Tried, ...] = ()
 
 
 class Effort(NamedTuple):

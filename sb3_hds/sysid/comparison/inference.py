@@ -1,8 +1,9 @@
-"""Standard errors, profile likelihoods, family-wise p-values, aliased candidates."""
+"""Standard errors, intervals, family-wise p-values, aliased candidates."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
 
 from sb3_hds.sysid.comparison.halves import Half
@@ -11,6 +12,7 @@ from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, Slopes
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 
+_CONFIDENCE = 0.9
 # Directions below this share of the largest curvature do not move.
 _RANK = 1e-10
 # Cosine of the angle between what two causes do beyond which they look alike.
@@ -189,6 +191,42 @@ def profiled(
         return float(np.clip(best + side * away, h.lower[index], h.upper[index]))
 
     return end(-1.0), end(1.0)
+
+
+def margin(n_clusters: int, stderr: np.ndarray) -> np.ndarray:
+    """:return: half the width of a symmetric interval"""
+    return scipy.stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_clusters - 1, 1)) * stderr
+
+
+def interval(
+    half: Half, point: Point, free: Sequence[int], index: int, reach: float, profiles: bool
+) -> tuple[float, float]:
+    """:param reach: half the width of the symmetric interval"""
+    h, best = half.evidence.hypotheses, float(point.theta[index])
+    if profiles:
+        return profiled(half.evidence, point, free, index, reach)
+    return max(best - reach, float(h.lower[index])), min(best + reach, float(h.upper[index]))
+
+
+def widened(estimate: float, low: float, high: float, off: float) -> tuple[float, float]:
+    """:param off: half the width of an independent error"""
+    return (
+        estimate - float(np.hypot(estimate - low, off)),
+        estimate + float(np.hypot(high - estimate, off)),
+    )
+
+
+def systematic(estimate: float, other: tuple[float, float, float] | None) -> float:
+    """
+    :param other: estimate of the equation of motion, with its interval
+    :return: by how much the two differ beyond that: smoothing spoils the one and integration the
+        other, and the noise of either says nothing of it
+    """
+    if other is None:
+        return 0.0
+    value, low, high = other
+    reach = high - value if estimate > value else value - low
+    return float(np.sqrt(max((estimate - value) ** 2 - reach**2, 0.0)))
 
 
 def family_p_value(

@@ -11,11 +11,11 @@ from sb3_hds.sysid.comparison.held_out import LEAST_BIC, Comparison, passes
 from sb3_hds.sysid.comparison.inference import aliased_with
 from sb3_hds.sysid.comparison.ranking import Ranking
 from sb3_hds.sysid.comparison.starts import Here, guesses
-from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.shooting import Shots
+from sb3_hds.sysid.progress import Bar
 
 # Candidates that others are tried beside.
 _MOST_FIRSTS = 4

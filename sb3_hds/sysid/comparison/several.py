@@ -6,10 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from sb3_hds.sysid.comparison.halves import NOT_FINITE, Base, Half, Tried
+from sb3_hds.sysid.comparison.halves import NOT_FINITE, Accepted, Base, Half, Tried
 from sb3_hds.sysid.comparison.held_out import Comparison, as_good, passes, t_or_rank_test
 from sb3_hds.sysid.comparison.search import Place, Search
-from sb3_hds.sysid.diagnosis.findings import Accepted
 from sb3_hds.sysid.equation.confirmation import simpler_items
 from sb3_hds.sysid.equation.members import Member
 from sb3_hds.sysid.equation.plausibility import rarity_of

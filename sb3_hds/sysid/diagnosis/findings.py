@@ -1,16 +1,21 @@
 """Findings in words: sizes, intervals, reasons, caveats."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
-import scipy
 from jaxtyping import Int
 
-from sb3_hds.sysid.checks.parameter_stability import Change
-from sb3_hds.sysid.comparison.halves import Base, Half, Tried
+from sb3_hds.sysid.comparison.halves import Accepted, Base, Half, Tried
 from sb3_hds.sysid.comparison.held_out import LEAST_GAIN, LEVEL, Comparison, t_test
-from sb3_hds.sysid.comparison.inference import aliased_with, profiled, standard_errors
+from sb3_hds.sysid.comparison.inference import (
+    aliased_with,
+    interval,
+    margin,
+    standard_errors,
+    systematic,
+    widened,
+)
+from sb3_hds.sysid.comparison.parameter_stability import Change
 from sb3_hds.sysid.comparison.unexplained import Remainder
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
@@ -26,7 +31,6 @@ UNCERTAIN, SMALL, CHANCE = "its size is uncertain", "it is small beside the othe
 NO_CONSTANT = "it comes near, but its size is not constant"
 NAMELESS = "a force without a name predicts better"
 ANOTHER = "its fitted sizes are those of another effect"
-_CONFIDENCE = 0.9
 # Of several causes, half the width of an interval is at least this share of the size: neither the
 # twin's integrator nor the smoothing of the equation of motion is better than that.
 _INEXACT = 0.01
@@ -34,32 +38,6 @@ _INEXACT = 0.01
 _CONTRADICTS = 0.01
 # Error of a window that a twin does not come near, in units of the noise, or of what is usual.
 _LOST = 10.0
-
-
-class Accepted(NamedTuple):
-    """
-    A cause that was confirmed.
-
-    :param alternatives: keys of candidates that the data cannot distinguish from it
-    :param family_p_value: family-wise p-value: that the best of all candidates gains as much if
-        nothing is wrong
-    :param share: of the force at its joint that it carries; None where that is not known
-    :param sizes: estimate and interval of the equation of motion by parameter, where there are any
-    :param of_equation: whether these are told, rather than those of a simulation
-    :param doubts: by parameter, half the width of an interval that comes from not knowing whether
-        there is one cause more
-    :param rivals: the alternatives as they were fitted, those that were simulated
-    """
-
-    tried: Tried
-    comparison: Comparison
-    alternatives: tuple[str, ...]
-    family_p_value: float
-    share: float | None = None
-    sizes: Mapping[str, tuple[float, float, float]] = {}
-    of_equation: bool = False
-    doubts: Mapping[str, float] = {}
-    rivals: tuple[Tried, ...] = ()
 
 
 def verdict_of(findings: Sequence[Finding], unexplained: str) -> Verdict:
@@ -101,14 +79,14 @@ def finding(
     for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
         if name in one.sizes and one.of_equation:
             estimate, low, high = one.sizes[name]
-            low, high = _widened(estimate, low, high, _INEXACT * abs(estimate))
+            low, high = widened(estimate, low, high, _INEXACT * abs(estimate))
             error = float((high - low) / (2.0 * unit))
         else:
-            low, high = _interval(half, point, free, i, float(reach[i]), profiles)
+            low, high = interval(half, point, free, i, float(reach[i]), profiles)
             estimate = float(theta[i])
-            off = np.hypot(one.doubts.get(name, 0.0), _systematic(estimate, one.sizes.get(name)))
+            off = np.hypot(one.doubts.get(name, 0.0), systematic(estimate, one.sizes.get(name)))
             off = np.hypot(off, _INEXACT * abs(estimate) if one.sizes else 0.0)
-            low, high = _widened(estimate, low, high, off)
+            low, high = widened(estimate, low, high, off)
             low, high = max(low, float(h.lower[i])), min(high, float(h.upper[i]))
             error = float(np.hypot(stderr[i], off / unit))
         short = name.rpartition(".")[2]
@@ -136,32 +114,6 @@ def finding(
         candidate.explanation,
         one.share,
     )
-
-
-def _widened(estimate: float, low: float, high: float, off: float) -> tuple[float, float]:
-    """:param off: half the width of an independent error"""
-    return (
-        estimate - float(np.hypot(estimate - low, off)),
-        estimate + float(np.hypot(high - estimate, off)),
-    )
-
-
-def _systematic(estimate: float, other: tuple[float, float, float] | None) -> float:
-    """
-    :param other: estimate of the equation of motion, with its interval
-    :return: by how much the two differ beyond that: smoothing spoils the one and integration the
-        other, and the noise of either says nothing of it
-    """
-    if other is None:
-        return 0.0
-    value, low, high = other
-    reach = high - value if estimate > value else value - low
-    return float(np.sqrt(max((estimate - value) ** 2 - reach**2, 0.0)))
-
-
-def margin(n_clusters: int, stderr: np.ndarray) -> np.ndarray:
-    """:return: half the width of a symmetric interval"""
-    return scipy.stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_clusters - 1, 1)) * stderr
 
 
 def to_tell_apart(found: Sequence[Accepted], hypotheses: Hypotheses) -> list[str]:
@@ -320,16 +272,6 @@ def contradiction(weighed: Sequence[tuple[Candidate, Comparison]]) -> str:
         f"{key} lowers the error of held-out recordings by {gain:.0%} (p = {p_value:.2g}), but "
         "the other recordings do not support it as the cause."
     )
-
-
-def _interval(
-    half: Half, point: Point, free: Sequence[int], index: int, reach: float, profiles: bool
-) -> tuple[float, float]:
-    """:param reach: half the width of the symmetric interval"""
-    h, best = half.evidence.hypotheses, float(point.theta[index])
-    if profiles:
-        return profiled(half.evidence, point, free, index, reach)
-    return max(best - reach, float(h.lower[index])), min(best + reach, float(h.upper[index]))
 
 
 def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int, HorizonGain]:

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_hds.sysid.comparison.halves import Base, Tried
+from sb3_hds.sysid.comparison.halves import Accepted, Base, Tried
 from sb3_hds.sysid.comparison.held_out import Comparison, as_good, passes
-from sb3_hds.sysid.comparison.inference import family_p_value, standard_errors
+from sb3_hds.sysid.comparison.inference import family_p_value, margin, standard_errors
 from sb3_hds.sysid.comparison.search import Search, places_of
 from sb3_hds.sysid.diagnosis.findings import (
     ANOTHER,
@@ -15,8 +15,6 @@ from sb3_hds.sysid.diagnosis.findings import (
     NAMELESS,
     SMALL,
     UNCERTAIN,
-    Accepted,
-    margin,
 )
 
 # Causes that are looked for.

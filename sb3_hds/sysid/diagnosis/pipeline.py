@@ -13,14 +13,13 @@ from sb3_hds.sysid.belief.opened import nothing_known, open_answers
 from sb3_hds.sysid.checks.adequacy import distances, far_in_words
 from sb3_hds.sysid.checks.conventions import Convention
 from sb3_hds.sysid.checks.timing import stepping_by
-from sb3_hds.sysid.comparison.halves import Base, Effort, Tried
+from sb3_hds.sysid.comparison.halves import Accepted, Base, Effort, Tried
 from sb3_hds.sysid.comparison.held_out import Comparison, as_good
 from sb3_hds.sysid.comparison.inference import detectable_sizes
 from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.comparison.several import confirmed_set, proposed_set
 from sb3_hds.sysid.diagnosis.findings import (
     SMALL,
-    Accepted,
     bounds_in_words,
     by_horizon,
     contradiction,
@@ -36,12 +35,12 @@ from sb3_hds.sysid.diagnosis.findings import (
 )
 from sb3_hds.sysid.diagnosis.naming import Naming, keys_of
 from sb3_hds.sysid.diagnosis.preparation import IRRELEVANT, hash_of, prepare
-from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.diagnosis.residuals import LEAST_SHARE, Left, Residuals
 from sb3_hds.sysid.equation.screening import Screened
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
 from sb3_hds.sysid.estimation.parameters import Belief, at_limit
+from sb3_hds.sysid.progress import Bar
 from sb3_hds.sysid.reporting.diagnosis import Diagnosis
 from sb3_hds.sysid.reporting.finding import Rejected
 from sb3_hds.sysid.reporting.pictures import pictures_of

@@ -20,7 +20,6 @@ from sb3_hds.sysid.checks.timing import align_velocities, match_logged_integrato
 from sb3_hds.sysid.comparison.halves import Half
 from sb3_hds.sysid.comparison.held_out import Split, split
 from sb3_hds.sysid.comparison.scales import sized
-from sb3_hds.sysid.diagnosis.progress import Bar
 from sb3_hds.sysid.equation.screening import SMALL_MACHINE, Screened, screen
 from sb3_hds.sysid.equation.terms import terms
 from sb3_hds.sysid.estimation.calibrate import channel_deviations
@@ -29,6 +28,7 @@ from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.parameters import Belief
 from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
 from sb3_hds.sysid.motion.motion import Motion, motion
+from sb3_hds.sysid.progress import Bar
 
 # Length of a window in periods of the motion, within these numbers of steps; it is half as long
 # where there would be fewer windows than that.

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_hds.sysid.checks.parameter_stability import Change, change
-from sb3_hds.sysid.comparison.halves import Base
+from sb3_hds.sysid.comparison.halves import Accepted, Base
+from sb3_hds.sysid.comparison.parameter_stability import Change, change
 from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.comparison.unexplained import (
     MissingForce,
@@ -17,7 +17,7 @@ from sb3_hds.sysid.comparison.unexplained import (
     short_windows,
     weighed,
 )
-from sb3_hds.sysid.diagnosis.findings import NO_CONSTANT, Accepted, nearest_in_words
+from sb3_hds.sysid.diagnosis.findings import NO_CONSTANT, nearest_in_words
 from sb3_hds.sysid.diagnosis.preparation import IRRELEVANT, Prepared
 
 # A cause that explains less than this share of what can be explained is not the cause.
