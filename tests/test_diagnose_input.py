@@ -9,7 +9,7 @@ from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import NO_EFFECTS, JointEffect, Trajectories
 from sb3_hds.data import SamplingWarning
 from sb3_hds.errors import CalibrationError, EffectError
-from sb3_hds.sysid.estimation.calibrate import check_fits
+from sb3_hds.sysid.measurements import check_fits
 
 FRICTION = (effects.ViscousFriction, effects.CoulombFriction)
 TWIN = twins.make("FreePendulum", driven=True, dt=0.02)

@@ -9,10 +9,10 @@ import pytest
 
 from sb3_hds import diagnose
 from sb3_hds.core import rollout
-from sb3_hds.sysid.estimation.calibrate import channel_deviations
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.shooting import shots_of
+from sb3_hds.sysid.measurements import channel_deviations
 from sb3_hds.sysid.motion.joints import motion_of
 
 pytestmark = [

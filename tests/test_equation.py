@@ -18,9 +18,10 @@ from sb3_hds.sysid.equation.screening import screen
 from sb3_hds.sysid.equation.terms import effective_inertia, terms
 from sb3_hds.sysid.equation.weak_form import weak_rows
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.measurements import white_noise
 from sb3_hds.sysid.motion.joints import differences, kinematics
 from sb3_hds.sysid.motion.motion import motion
-from sb3_hds.sysid.motion.smoothing import smooth, white_noise
+from sb3_hds.sysid.motion.smoothing import smooth
 
 
 def proposed(twin, data, calibrate=()):
@@ -341,7 +342,7 @@ def test_smoothing_removes_noise_and_no_motion():
     noisy_q, noisy_v = (x + s * rng.standard_normal(1001) for x, s in ((q, 1e-3), (v, 0.05)))
     found = smooth(noisy_q, noisy_v, dt)
 
-    assert white_noise(noisy_v) == pytest.approx(0.05, rel=0.1)
+    assert white_noise([noisy_v]) == pytest.approx(0.05, rel=0.1)
     assert found.noise_v == pytest.approx(0.05, rel=0.1)
     assert np.std(found.v - v) < 2.0 * found.error_v < 0.02
     assert np.std(found.a + 4.0 * q) < 0.2

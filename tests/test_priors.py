@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sb3_hds import Trajectories
 from sb3_hds.core import Channel, Parameter
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.checks.adequacy import distances, far_in_words, noise_of
+from sb3_hds.sysid.checks.adequacy import distances, far_in_words
 from sb3_hds.sysid.estimation.parameters import at_limit, prior_of
+from sb3_hds.sysid.measurements import white_noise
 
 MASS = Parameter(null=1.0, scale=0.1, unit="kg", lower=1e-6)
 DAMPING = Parameter(null=0.0, scale=0.1, unit="N s/m", lower=0.0)
@@ -36,9 +36,8 @@ def test_noise_is_distinguished_from_a_smooth_motion():
     rng, t = np.random.default_rng(0), 0.01 * np.arange(2001)
     obs = np.stack([np.sin(3.0 * t), 3.0 * np.cos(3.0 * t)], 1)
     noisy = obs + rng.standard_normal(obs.shape) * [1e-3, 0.05]
-    data = Trajectories.from_arrays([noisy], [np.zeros((2000, 0))], dt=0.01)
 
-    assert noise_of(data) == pytest.approx([1e-3, 0.05], rel=0.1)
+    assert white_noise([noisy]) == pytest.approx([1e-3, 0.05], rel=0.1)
 
 
 def test_large_deviations_are_reported_in_the_unit_of_the_channel_and_as_shares():

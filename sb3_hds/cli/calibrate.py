@@ -69,8 +69,8 @@ def run(given: argparse.Namespace) -> None:
     from sb3_hds.data import audit
     from sb3_hds.errors import TrajectoryError
     from sb3_hds.sysid import calibrate
-    from sb3_hds.sysid.estimation.calibrate import check_fits
     from sb3_hds.sysid.estimation.parameters import free_names
+    from sb3_hds.sysid.measurements import check_fits
 
     measured.check_targets(given)
     twin, data = measured.twin_and_data(given)

@@ -6,17 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.core import Channel, Trajectories
+from sb3_hds.core import Channel
 
 # A model predicts to near the noise where its error is below this multiple of it, or below this
 # share of the channel's standard deviation, whichever is larger.
 _NEAR, _SMALL = 3.0, 0.05
 # Larger errors, in standard deviations of the channel, are those of a simulation that diverges.
 _DIVERGED = 1e3
-# Of white noise of one, the standard deviation of fourth differences; a smooth signal has none.
-_FOURTH = np.sqrt(70.0)
-# Standard deviation of normal noise, in units of its median absolute value.
-_NORMAL = 1.4826
 
 
 class Distance(NamedTuple):
@@ -46,19 +42,6 @@ class Distance(NamedTuple):
             f"{self.channel.name} by {self.error:.3g}{unit}, {self.error / self.deviation:.0%} of "
             f"its standard deviation (the noise is about {self.noise:.2g}{unit})"
         )
-
-
-def noise_of(data: Trajectories) -> Float[np.ndarray, " obs"]:
-    """
-    :return: standard deviation of each channel's white noise, from fourth differences of its
-        samples, which a smooth motion hardly has; where the motion is not smooth from sample to
-        sample, more than that
-    """
-    rows = [data.episode(i)[0] for i in range(len(data))]
-    fourth = [np.diff(row, 4, axis=0) for row in rows if len(row) > 4]
-    if not fourth:
-        return np.zeros(data.n_obs)
-    return _NORMAL * np.median(np.abs(np.concatenate(fourth)), axis=0) / _FOURTH
 
 
 def distances(

@@ -14,7 +14,6 @@ from sb3_hds.core.twin import plant_of
 from sb3_hds.data import Audit, audit
 from sb3_hds.data.audit.jumps import Glitches, Outliers
 from sb3_hds.data.audit.velocity import BackwardDifference
-from sb3_hds.sysid.checks.adequacy import noise_of
 from sb3_hds.sysid.checks.conventions import Convention, other_convention
 from sb3_hds.sysid.checks.timing import align_velocities, match_logged_integrator
 from sb3_hds.sysid.comparison.halves import Half
@@ -22,11 +21,11 @@ from sb3_hds.sysid.comparison.held_out import Split, split
 from sb3_hds.sysid.comparison.scales import sized
 from sb3_hds.sysid.equation.screening import SMALL_MACHINE, Screened, screen
 from sb3_hds.sysid.equation.terms import terms
-from sb3_hds.sysid.estimation.calibrate import channel_deviations
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.parameters import Belief
 from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
+from sb3_hds.sysid.measurements import channel_deviations, white_noise
 from sb3_hds.sysid.motion.motion import Motion, motion
 from sb3_hds.sysid.progress import Bar
 
@@ -200,7 +199,7 @@ def prepare(
     data, audited, corrected = _without_glitches(twin, data)
     data, shortened = shortened_to(twin, data)
     data, in_time = align_velocities(twin, data)
-    sensor_noise = noise_of(data)
+    sensor_noise = white_noise([data.episode(i)[0] for i in range(len(data))])
     twin, data, as_logged = match_logged_integrator(twin, data)
     moved = motion(twin, data)
     period = moved.typical_period

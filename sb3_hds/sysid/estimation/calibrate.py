@@ -10,8 +10,6 @@ from jaxtyping import Float
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.core.numerics.compilation import keep_programs
-from sb3_hds.core.trajectories.episodes import same_interval
-from sb3_hds.data.resampling.report import Reading
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
@@ -20,6 +18,7 @@ from sb3_hds.sysid.estimation.normal_equations import Uncertainty, covariance_of
 from sb3_hds.sysid.estimation.parameters import Free, free_names, nominal_values, one_each, tie
 from sb3_hds.sysid.estimation.results import Estimate, Fit
 from sb3_hds.sysid.estimation.shooting import Shots, n_free, shots_of
+from sb3_hds.sysid.measurements import channel_deviations, check_fits
 
 # Length of a window where none is given [s], within these numbers of steps.
 _WINDOW = 0.5
@@ -35,8 +34,6 @@ _PASSES = 3
 _FIRST_STEPS, _LEAST_STEP = 8, 1e-3
 # An estimate this close to a bound counts as on it, in units of its scale.
 _ON_BOUND = 1e-3
-# From this ratio of two intervals on, one is taken to be in another unit.
-_OTHER_UNIT = 100.0
 
 
 def calibrate(
@@ -244,43 +241,6 @@ def default_window(data: Trajectories) -> int:
     """:return: steps per window"""
     steps = int(np.clip(round(_WINDOW / data.dt), _SHORTEST, _LONGEST))
     return min(steps, int(data.lengths.max()))
-
-
-def channel_deviations(data: Trajectories) -> Float[np.ndarray, " obs"]:
-    """:return: standard deviation of each channel over the data, one where it never changes"""
-    real = np.concatenate([data.episode(i)[0] for i in range(len(data))])
-    deviations = real.std(0)
-    return np.where(deviations > 0.0, deviations, 1.0)
-
-
-def check_fits(twin: Twin, data: Trajectories) -> None:
-    """:raises CalibrationError: if the data cannot have been measured on what the twin simulates"""
-    if (data.n_obs, data.n_act) != (len(twin.channels), len(twin.actuators)):
-        names = ", ".join(channel.name for channel in twin.channels)
-        raise CalibrationError(
-            f"{twin.name} observes {len(twin.channels)} channels ({names}) and takes "
-            f"{len(twin.actuators)} commands; the data have {data.n_obs} and {data.n_act}. "
-            "Choose the columns, or the twin, that fit."
-        )
-    report = data.report if isinstance(data.report, Reading) else None
-    misfit = report.misfit(twin.channels, twin.actuators) if report else ""
-    if misfit:
-        raise CalibrationError(misfit)
-    if not same_interval(data.dt, twin.dt):
-        unit = ""
-        if data.dt / twin.dt >= _OTHER_UNIT:
-            order = int(np.clip(round(np.log10(data.dt / twin.dt) / 3.0), 1, 3))
-            unit = (
-                f"The column of time may be in {('milli', 'micro', 'nano')[order - 1]}seconds: "
-                "then say so in the map of columns, "
-                f"time: {{column: NAME, scale: {10.0 ** (-3 * order):g}}}. Otherwise: "
-            )
-        raise CalibrationError(
-            f"{twin.name} steps by {twin.dt:g} s and the data are sampled every {data.dt:g} s. "
-            f"{unit}Use data.resample(dt={twin.dt:g}) (in the map of "
-            f"columns, dt: {twin.dt:g}), or make the twin with dt={data.dt:g} (on the command "
-            f"line, --set dt:{data.dt:g})."
-        )
 
 
 def _noise(

@@ -15,9 +15,10 @@ from sb3_hds.core import AnalyticTwin, Params, State, Trajectories, TransformedT
 from sb3_hds.core.twin import layers_of, plant_of
 from sb3_hds.effects import NeuralForce, force_of
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.estimation.calibrate import channel_deviations, check_fits, default_window
+from sb3_hds.sysid.estimation.calibrate import default_window
 from sb3_hds.sysid.estimation.prediction import hold_out, is_better, start_states, window_errors
-from sb3_hds.sysid.estimation.shooting import Shots, places_of, shots_of, simulate
+from sb3_hds.sysid.estimation.shooting import Shots, places_and_ages_of, shots_of, simulate
+from sb3_hds.sysid.measurements import channel_deviations, check_fits
 
 # Unit of errors where the noise is not known, in standard deviations of a channel.
 _UNIT_ERROR = 0.05
@@ -123,7 +124,7 @@ def fit_residual(
     return fit_force(
         twin,
         shots,
-        hold_out(rank, places_of(data, length, n_windows, seed)[0]),
+        hold_out(rank, places_and_ages_of(data, length, n_windows, seed)[0]),
         scale,
         n_members=n_members,
         net_arch=net_arch,

@@ -103,7 +103,7 @@ def shots_of(
     return shots, origin
 
 
-def places_of(
+def places_and_ages_of(
     data: Trajectories, length: int, n_rows: int | None = None, seed: int | None = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """

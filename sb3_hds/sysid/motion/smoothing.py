@@ -11,13 +11,12 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
+from sb3_hds.sysid.measurements import white_noise
+
 # Degree of the polynomial, and half widths of its window in samples.
 _DEGREE, _HALVES = 4, (3, 4, 6, 8, 11, 15, 20, 28, 40)
 # A window is too wide if its residuals exceed those of the narrowest one by this factor.
 _TOLERANCE = 1.15
-# Of white noise of one, the standard deviation of fourth differences.
-_FOURTH = np.sqrt(70.0)
-_NORMAL = 1.4826
 
 
 class Smoothed(NamedTuple):
@@ -42,13 +41,6 @@ class Smoothed(NamedTuple):
     half: int
 
 
-def white_noise(x: Float[np.ndarray, " rows"]) -> float:
-    """:return: standard deviation of white noise on a smooth signal, from its fourth differences"""
-    if len(x) < 6:
-        return 0.0
-    return float(_NORMAL * np.median(np.abs(np.diff(x, 4))) / _FOURTH)
-
-
 def smooth(
     q: Float[np.ndarray, " rows"],
     v: Float[np.ndarray, " rows"] | None,
@@ -63,8 +55,8 @@ def smooth(
         :func:`~sb3_hds.sysid.motion.joints.velocity_time_of` has it
     """
     least = 1e-12 * (np.ptp(q) + 1e-300)
-    noise_q = max(white_noise(q), least)
-    noise_v = 1.0 if v is None else max(white_noise(v), least / dt)
+    noise_q = max(float(white_noise([q])), least)
+    noise_v = 1.0 if v is None else max(float(white_noise([v])), least / dt)
     ratio = noise_q / (noise_v * dt)
     narrowest, best = None, None
     for half in _HALVES:

@@ -23,7 +23,7 @@ from sb3_hds.algos.twin.model import missing_effects, nulls_of
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import Fit
-from sb3_hds.sysid.estimation.calibrate import channel_deviations, check_fits, fit_windows
+from sb3_hds.sysid.estimation.calibrate import fit_windows
 from sb3_hds.sysid.estimation.parameters import every_name, free_names, untied
 from sb3_hds.sysid.estimation.prediction import (
     gain,
@@ -32,6 +32,7 @@ from sb3_hds.sysid.estimation.prediction import (
     single_step_errors,
 )
 from sb3_hds.sysid.estimation.residual_force import Residual, fit_force
+from sb3_hds.sysid.measurements import channel_deviations, check_fits
 
 # A twin is exact if this quantile of the errors of this number of latest single steps is below this
 # threshold. The quantile is high, since every twin is exact at rest.

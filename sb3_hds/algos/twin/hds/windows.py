@@ -9,7 +9,7 @@ from sb3_hds.core import Params, Trajectories, Twin
 from sb3_hds.effects import force_of
 from sb3_hds.sysid.estimation.calibrate import default_window
 from sb3_hds.sysid.estimation.prediction import has_grown, hold_out, window_errors
-from sb3_hds.sysid.estimation.shooting import Shots, places_of, shots_of
+from sb3_hds.sysid.estimation.shooting import Shots, places_and_ages_of, shots_of
 
 # A twin whose window errors are below this share of the channels' deviations needs no correction.
 EXACT = 1e-3
@@ -81,7 +81,7 @@ def windows_of(
     """:return: the latest windows, none of them held out"""
     length = default_window(data)
     shots, origin = shots_of(data, length, twin, _N_WINDOWS, seed=None)
-    place, age = places_of(data, length, _N_WINDOWS, seed=None)
+    place, age = places_and_ages_of(data, length, _N_WINDOWS, seed=None)
     windows = Windows(shots, origin, place, age, std, np.zeros(len(origin), bool))
     return windows if change is None else _leave_out(windows, np.flatnonzero(age > change.n_steps))
 

@@ -1,0 +1,69 @@
+"""Recordings beside a twin: whether they fit it, how much each channel varies, and its noise."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from sb3_hds.core import Trajectories, Twin
+from sb3_hds.core.trajectories.episodes import same_interval
+from sb3_hds.data.resampling.report import Reading
+from sb3_hds.errors import CalibrationError
+
+# From this ratio of two intervals on, one is taken to be in another unit.
+_OTHER_UNIT = 100.0
+# Of white noise of one, the standard deviation of fourth differences: the root of the sum of the
+# squared binomial coefficients, 1 + 16 + 36 + 16 + 1. A smooth signal has hardly any.
+_FOURTH = np.sqrt(70.0)
+# Standard deviation of normal noise, in units of its median absolute value.
+_NORMAL = 1.4826
+# Rows of a recording from which fourth differences are taken.
+_FEWEST_ROWS = 6
+
+
+def white_noise(recordings: Sequence[Float[np.ndarray, "rows *k"]]) -> Float[np.ndarray, "*k"]:
+    """
+    :return: standard deviation of white noise on a smooth signal, from its fourth differences; more
+        than that where the signal is not smooth from sample to sample
+    """
+    fourth = [np.diff(x, 4, axis=0) for x in recordings if len(x) >= _FEWEST_ROWS]
+    if not fourth:
+        return np.zeros(recordings[0].shape[1:])
+    return np.asarray(_NORMAL * np.median(np.abs(np.concatenate(fourth)), axis=0) / _FOURTH)
+
+
+def channel_deviations(data: Trajectories) -> Float[np.ndarray, " obs"]:
+    """:return: standard deviation of each channel over the data, one where it never changes"""
+    real = np.concatenate([data.episode(i)[0] for i in range(len(data))])
+    deviations = real.std(0)
+    return np.where(deviations > 0.0, deviations, 1.0)
+
+
+def check_fits(twin: Twin, data: Trajectories) -> None:
+    """:raises CalibrationError: if the data cannot have been measured on what the twin simulates"""
+    if (data.n_obs, data.n_act) != (len(twin.channels), len(twin.actuators)):
+        names = ", ".join(channel.name for channel in twin.channels)
+        raise CalibrationError(
+            f"{twin.name} observes {len(twin.channels)} channels ({names}) and takes "
+            f"{len(twin.actuators)} commands; the data have {data.n_obs} and {data.n_act}. "
+            "Choose the columns, or the twin, that fit."
+        )
+    report = data.report if isinstance(data.report, Reading) else None
+    misfit = report.misfit(twin.channels, twin.actuators) if report else ""
+    if misfit:
+        raise CalibrationError(misfit)
+    if not same_interval(data.dt, twin.dt):
+        unit = ""
+        if data.dt / twin.dt >= _OTHER_UNIT:
+            order = int(np.clip(round(np.log10(data.dt / twin.dt) / 3.0), 1, 3))
+            unit = (
+                f"The column of time may be in {('milli', 'micro', 'nano')[order - 1]}seconds: "
+                "then say so in the map of columns, "
+                f"time: {{column: NAME, scale: {10.0 ** (-3 * order):g}}}. Otherwise: "
+            )
+        raise CalibrationError(
+            f"{twin.name} steps by {twin.dt:g} s and the data are sampled every {data.dt:g} s. "
+            f"{unit}Use data.resample(dt={twin.dt:g}) (in the map of "
+            f"columns, dt: {twin.dt:g}), or make the twin with dt={data.dt:g} (on the command "
+            f"line, --set dt:{data.dt:g})."
+        )
