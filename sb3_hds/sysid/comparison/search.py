@@ -366,7 +366,7 @@ class Search(NamedTuple):
         if evidence.shots.n > most:
             rng = np.random.default_rng(0)
             sample = np.sort(rng.choice(evidence.shots.n, most, replace=False))
-            evidence = evidence.on(type(evidence.shots)(*(x[sample] for x in evidence.shots)))
+            evidence = evidence.on(evidence.shots.rows(sample))
             point = point._replace(offsets=point.offsets[sample])
         return Here(evidence, point, base.free, self.effort.steps)
 

@@ -16,7 +16,7 @@ from sb3_hds.sysid.equation.screening import Screened
 from sb3_hds.sysid.equation.selection import LATE
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point, in_threads
-from sb3_hds.sysid.estimation.shooting import Shots, evenly
+from sb3_hds.sysid.estimation.shooting import evenly
 from sb3_hds.sysid.motion.joints import encoders
 
 # Level at which each member has to be missed by held-out recordings when it is left out.
@@ -240,7 +240,7 @@ def _each_left_out(
 ) -> dict[str, Comparison]:
     """:return: of some members of a large set, held-out errors with each beside those without it"""
     half, some = search.confirm, evenly(search.confirm.evidence.shots.n, _SOME_WINDOWS)
-    shots = Shots(*(np.asarray(leaf)[some] for leaf in half.evidence.shots))
+    shots = half.evidence.shots.rows(some)
     half = half._replace(evidence=half.evidence.on(shots), cluster=half.cluster[some])
     kept = base.kept._replace(offsets=base.kept.offsets[some], raw=base.kept.raw[some])
 

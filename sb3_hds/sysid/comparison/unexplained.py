@@ -130,7 +130,7 @@ def short_windows(
         counter[recording] = counter.get(recording, -1) + 1
         time[i] = counter[recording] * (steps + 1) * data.dt
     some = evenly(len(origin), most)
-    shots, origin = Shots(*(np.asarray(leaf)[some] for leaf in shots)), origin[some]
+    shots, origin = shots.rows(some), origin[some]
     counted = (np.arange(longest + 1) <= steps).astype(float)
     short = evidence.on(_lengthened(shots, longest), counted)
     return ShortWindows(short, short.fit(theta, (), n_steps=_STEPS), shots, origin, time[some])

@@ -151,7 +151,7 @@ class Prepared:
     def halves(self) -> tuple[Half, Half]:
         """:return: the evidence that proposes and the one that confirms, parameters scaled"""
         rows = ~self.parts.held_out, self.parts.held_out
-        shots = [_rows_of(self.shots, own) for own in rows]
+        shots = [self.shots.rows(own) for own in rows]
         evidence = Evidence(
             self.hypotheses,
             shots[0],
@@ -223,7 +223,7 @@ def prepare(
     if len(twin.joints) > SMALL_MACHINE:
         most_windows = _WINDOWS_OF_ALL_JOINTS // len(twin.joints)
         some = evenly(len(origin), 2 * most_windows)
-        shots, origin = _rows_of(shots, some), origin[some]
+        shots, origin = shots.rows(some), origin[some]
     return Prepared(
         audit=audited,
         corrected=(*corrected, *shortened, *in_time, *as_logged),
@@ -382,7 +382,3 @@ def _window_of(data: Trajectories, span: float) -> int:
     whole = filling(steps)
     few = np.sum((data.lengths + 1) // (whole + 1)) < _FEW
     return filling(steps // 2) if few and steps >= 2 * _SHORTEST else whole
-
-
-def _rows_of(shots: Shots, rows: np.ndarray) -> Shots:
-    return Shots(*(np.asarray(leaf)[rows] for leaf in shots))

@@ -156,7 +156,7 @@ def fit_windows(
             f"parameters with the start states are {unknown} unknowns. Record more, free fewer "
             "parameters, or ask for longer windows."
         )
-    kept, origin = Shots(*(np.asarray(leaf)[real] for leaf in shots)), origin[real]
+    kept, origin = shots.rows(real), origin[real]
     evidence = Evidence(
         Hypotheses.of_values(twin, free, believed, prior),
         kept,
@@ -206,7 +206,7 @@ def _fit_forces(
     real, deviations = origin >= 0, channel_deviations(data)
     evidence = Evidence(
         Hypotheses.of_values(twin, free),
-        Shots(*(np.asarray(leaf)[real] for leaf in shots)),
+        shots.rows(real),
         _FIRST_NOISE * deviations,
         width=0,
         portion=portion_for(shots.n),

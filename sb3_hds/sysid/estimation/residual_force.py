@@ -172,7 +172,7 @@ def fit_force(
     assert attached is not None
     key, force = attached
     without = {**extended.params, f"{key}.share": 0.0}
-    seen = _seen(extended, Shots(*(leaf[learned] for leaf in shots)))
+    seen = _seen(extended, shots.rows(learned))
     tensors = {name: extended.tensors[f"{key}.{name}"] for name in force.tensors}
     if extended is not twin:
         tensors = _normalised(extended, force, seen, seed)

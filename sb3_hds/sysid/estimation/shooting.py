@@ -64,6 +64,10 @@ class Shots(NamedTuple):
         """Number of rows, those that only fill up the shape among them."""
         return len(self.weight)
 
+    def rows(self, index: np.ndarray) -> "Shots":
+        """:return: some of the windows, by their indices or a mask of shape ``(n,)``"""
+        return Shots(*(np.asarray(leaf)[index] for leaf in self))
+
 
 def evenly(n: int, most: int) -> np.ndarray:
     """:return: ``most`` of ``n`` indices, equally spaced; all of them if there are fewer"""
