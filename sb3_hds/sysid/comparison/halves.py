@@ -1,6 +1,6 @@
 """Half of the recordings propose, the others confirm: models and candidates on both halves."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,12 +26,18 @@ class Half(NamedTuple):
     cluster: Int[np.ndarray, " n"]
     irrelevant: Float[np.ndarray, " obs"]
 
-    def errors(self, point: Point) -> Float[np.ndarray, " n"]:
-        """:return: mean square error of each window, that of practical equivalence added"""
-        noise = self.evidence.noise
-        errors = np.mean((point.raw / noise) ** 2, (1, 2))
+    def errors(
+        self, point: Point, channels: Sequence[int] | None = None
+    ) -> Float[np.ndarray, " n"]:
+        """
+        :param channels: indices of those that count; default: all
+        :return: mean square error of each window, that of practical equivalence added
+        """
+        own = slice(None) if channels is None else list(channels)
+        noise = self.evidence.noise[own]
+        errors = np.mean((point.raw[..., own] / noise) ** 2, (1, 2))
         errors = np.nan_to_num(errors, nan=NOT_FINITE, posinf=NOT_FINITE)
-        return errors + float(np.mean((self.irrelevant / noise) ** 2))
+        return errors + float(np.mean((self.irrelevant[own] / noise) ** 2))
 
     def total(self, point: Point) -> float:
         return float(self.errors(point).sum())

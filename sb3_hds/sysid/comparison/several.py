@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from sb3_hds.sysid.comparison.halves import NOT_FINITE, Accepted, Base, Half, Tried
+from sb3_hds.sysid.comparison.halves import Accepted, Base, Half, Tried
 from sb3_hds.sysid.comparison.held_out import Comparison, as_good, passes, t_or_rank_test
 from sb3_hds.sysid.comparison.search import Place, Search
 from sb3_hds.sysid.equation.confirmation import simpler_items
@@ -297,7 +297,7 @@ def _accepted(
 def _at_own_joint(half: Half, candidate: Candidate, new: Point, old: Point) -> Comparison:
     """Held-out errors of the channels of the joint where a cause acts, or of all."""
     channels = own_channels(half, candidate)
-    return t_or_rank_test(_errors(half, new, channels), _errors(half, old, channels), half.cluster)
+    return t_or_rank_test(half.errors(new, channels), half.errors(old, channels), half.cluster)
 
 
 def own_channels(half: Half, candidate: Candidate) -> Sequence[int]:
@@ -310,10 +310,3 @@ def own_channels(half: Half, candidate: Candidate) -> Sequence[int]:
         return every
     encoder = encoders(twin).get(candidate.index)
     return every if encoder is None else encoder.channels
-
-
-def _errors(half: Half, point: Point, channels: Sequence[int]) -> np.ndarray:
-    noise = half.evidence.noise[list(channels)]
-    errors = np.mean((point.raw[..., list(channels)] / noise) ** 2, (1, 2))
-    floor = float(np.mean((half.irrelevant[list(channels)] / noise) ** 2))
-    return np.nan_to_num(errors, nan=NOT_FINITE, posinf=NOT_FINITE) + floor
