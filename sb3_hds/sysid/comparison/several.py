@@ -9,7 +9,7 @@ import scipy
 from sb3_hds.sysid.comparison.halves import Accepted, Base, Half, Tried
 from sb3_hds.sysid.comparison.held_out import Comparison, as_good, passes, t_or_rank_test
 from sb3_hds.sysid.comparison.search import Place, Search
-from sb3_hds.sysid.equation.confirmation import simpler_items
+from sb3_hds.sysid.equation.held_out_folds import simpler_items
 from sb3_hds.sysid.equation.members import Member
 from sb3_hds.sysid.equation.plausibility import rarity_of
 from sb3_hds.sysid.equation.screening import Screened

@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 
 from sb3_hds.core import Effect
-from sb3_hds.sysid.equation.confirmation import equivalents, held_out_gain
+from sb3_hds.sysid.equation.held_out_folds import equivalents, held_out_gain
 from sb3_hds.sysid.equation.plausibility import plausibility
 from sb3_hds.sysid.equation.problem import Problem
 from sb3_hds.sysid.equation.regression import Equation, Item, Solution

@@ -8,7 +8,7 @@ import numpy as np
 from sb3_hds.core import AnalyticTwin, Effect, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.sysid.equation.assembly import equation, problem, refuted_by_kinematics
-from sb3_hds.sysid.equation.confirmation import enforce_bounds, predictable, retune, simpler_items
+from sb3_hds.sysid.equation.held_out_folds import enforce_bounds, predictable, retune, simpler_items
 from sb3_hds.sysid.equation.members import (
     ByVelocity,
     FrictionCurve,

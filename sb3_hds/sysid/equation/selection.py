@@ -1,17 +1,19 @@
 """Subset selection: a local search over sets of causes, confirmed on held-out data."""
 
 import itertools
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from sb3_hds.sysid.equation.confirmation import (
-    drop_negligible,
-    drop_unconfirmed,
-    prefer_plausible,
+from sb3_hds.sysid.equation.held_out_folds import (
+    EQUIVALENT,
+    WORSE,
+    enforce_bounds,
+    equivalents,
+    held_out_gain,
+    predictable,
     retune,
-    simplify,
-    split_hints,
+    simpler_items,
     substitutes,
 )
 from sb3_hds.sysid.equation.problem import SHARED, Problem
@@ -26,6 +28,17 @@ _VISCOUS, _DRY = "viscous_friction", "coulomb_friction"
 LATE = ("action_delay", "motor_lag")
 # Number of joints from which the same effect may stand for one that all actuators share.
 _MANY_JOINTS = 3
+# Least share of a joint's force that a member carries, least t statistic of its held-out gain, and
+# its increase for each unit of rarity.
+_MATERIAL, _CONFIRMED, _RARE = 0.006, 1.5, 0.9
+# Below that share, a member is kept if it lowers the logarithm of the others' residual by this
+# much.
+_TRACE, _MOST_OF_THE_REST = 1e-3, 0.7
+# A member whose force is below this multiple of the unexplained residual is only a hint; the
+# multiple is smaller for effects that are less rare than this.
+_OUTSTANDING, _RAREST = 1.5, 2.0
+# Gain in the logarithm of held-out errors that does not justify more parameters.
+_NO_MATTER = 0.02
 
 
 def propose(problem: Problem) -> tuple[list[int], list[int]]:
@@ -36,11 +49,11 @@ def propose(problem: Problem) -> tuple[list[int], list[int]]:
     _, keys = min((_climb(problem, start) for start in _starts(problem)), key=lambda r: r[0])
     keys = _try_shared(problem, keys)
     keys = _retry_without_doubtful(problem, keys)
-    keys = drop_negligible(problem, keys)
-    keys = simplify(problem, keys)
-    keys = prefer_plausible(problem, keys)
-    keys = simplify(problem, drop_unconfirmed(problem, keys))
-    return split_hints(problem, keys)
+    keys = _drop_negligible(problem, keys)
+    keys = _simplify(problem, keys)
+    keys = _prefer_plausible(problem, keys)
+    keys = _simplify(problem, _drop_unconfirmed(problem, keys))
+    return _split_hints(problem, keys)
 
 
 # ------------------------------------------------------------------------------ starts
@@ -196,3 +209,102 @@ def _retry_without_doubtful(p: Problem, keys: list[int]) -> list[int]:
         if new_score < score - 1e-6:
             score, keys = new_score, new
     return keys
+
+
+# ------------------------------------------------------------------------------ confirmation
+def _drop_negligible(p: Problem, keys: list[int]) -> list[int]:
+    """Remove members with a negligible force, unless they explain most of what the others leave."""
+    held = p.held_out(keys)
+    kept: set[int] = set()
+    while keys:
+        own = [i in p.always or i in kept for i in keys]
+        share = np.where(own, 1.0, p.force_shares(keys))
+        worst = int(np.argmin(share))
+        if share[worst] > _MATERIAL:
+            break
+        rest = [i for i in keys if i != keys[worst]]
+        without = p.held_out(rest)
+        if (
+            share[worst] > _TRACE
+            and held_out_gain(p, without, held, keys[worst])[0] > _MOST_OF_THE_REST
+        ):
+            kept.add(keys[worst])
+        else:
+            keys, held = rest, without
+    return keys
+
+
+def _simplify(p: Problem, keys: list[int]) -> list[int]:
+    """Replace a member by a simpler one of its family that predicts held-out data as well."""
+    for i in list(keys):
+        others = simpler_items(p, i)
+        if not others:
+            continue
+        rest = [m for m in keys if m != i]
+        held = p.held_out(keys)
+        gained, _ = held_out_gain(p, p.held_out(rest), held, i)
+        for other in others:
+            if not np.isfinite(p.score([*rest, other])):
+                continue
+            lost, t = held_out_gain(p, p.held_out([*rest, other]), held, i)
+            if t < WORSE or lost < max(_NO_MATTER, EQUIVALENT * gained):
+                keys = [*rest, other]
+    return keys
+
+
+def _prefer_plausible(p: Problem, keys: list[int]) -> list[int]:
+    """
+    Among candidates that the data cannot distinguish, choose the one with the best prior odds.
+    """
+    for i in list(keys):
+        if i in p.always:
+            continue
+        rest, held = [m for m in keys if m != i], p.held_out(keys)
+        gained, _ = held_out_gain(p, p.held_out(rest), held, i)
+        others = [o for o in equivalents(p, keys, i, held, gained) if p.rarity[o] < p.rarity[i]]
+        if others:
+            keys = [*rest, min(others, key=lambda o: (p.rarity[o], p.score([*rest, o])))]
+    return keys
+
+
+def _drop_unconfirmed(p: Problem, keys: list[int]) -> list[int]:
+    """Remove members, the least significant first, until all lower held-out errors."""
+    while keys:
+        held = p.held_out(keys)
+        t = [
+            np.inf
+            if i in p.always
+            else held_out_gain(p, p.held_out([m for m in keys if m != i]), held, i)[1]
+            for i in keys
+        ]
+        # The rarer a cause is, the surer it has to be.
+        short = [x - (_CONFIRMED + _RARE * p.rarity[i]) for i, x in zip(keys, t, strict=True)]
+        if min(short) > 0.0:
+            break
+        rest = [i for i, x in zip(keys, short, strict=True) if x > min(short)]
+        keys = enforce_bounds(p, retune(p, rest))
+    return keys
+
+
+def _split_hints(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
+    """
+    An effect that is no larger than the unexplained structure may be a part of that misfit.
+
+    :return: members that stand out, and hints
+    """
+    keys, hints = list(keys), []
+    while keys:
+        found, grams = p.solve(keys), p.grams
+        rss = np.maximum([found.weights @ g @ found.weights for g in grams.by_joint], 1e-12)
+        share = np.sqrt(rss / grams.effective) * grams.scale / (p.force * grams.gain)
+        left = share * np.sqrt(np.clip(predictable(p, keys), 0.0, 1.0))
+        ratio = []
+        for i in keys:
+            # Friction, which every joint has, may be smaller than rare effects.
+            least = _OUTSTANDING * (1.0 + min(p.rarity[i], _RAREST)) / (1.0 + _RAREST)
+            own = p.force_of(i, found) / p.force / np.maximum(left, 1e-6) / least
+            ratio.append(np.inf if i in p.always else float(np.max(own)))
+        if min(ratio) >= 1.0:
+            break
+        hints.append(keys.pop(int(np.argmin(ratio))))
+    return keys, hints

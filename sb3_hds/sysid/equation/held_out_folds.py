@@ -1,4 +1,4 @@
-"""Confirmation of the members of a set on held-out data, and their equivalents."""
+"""Sets of causes on held-out folds of the data: gains, equivalents, and what is predictable."""
 
 from collections.abc import Iterator, Sequence
 
@@ -8,23 +8,13 @@ from sb3_hds.sysid.equation.problem import SHARED, Problem
 from sb3_hds.sysid.equation.regression import TINY
 from sb3_hds.sysid.equation.weak_form import rich_columns
 
-# Least share of a joint's force that a member carries, least t statistic of its held-out gain, and
-# its increase for each unit of rarity.
-_MATERIAL, _CONFIRMED, _RARE = 0.006, 1.5, 0.9
-# Below that share, a member is kept if it lowers the logarithm of the others' residual by this
-# much.
-_TRACE, _MOST_OF_THE_REST = 1e-3, 0.7
-# A member whose force is below this multiple of the unexplained residual is only a hint; the
-# multiple is smaller for effects that are less rare than this.
-_OUTSTANDING, _RAREST = 1.5, 2.0
 # An alternative may score worse by this, and predicts held-out data as well to within this t or
 # share.
-_CLOSE, _WORSE, _SAME = 8.0, 2.0, 0.2
+_CLOSE, WORSE, _SAME = 8.0, 2.0, 0.2
 # Region of practical equivalence: a loss below this share of the member's gain counts as none.
-_EQUIVALENT = 0.05
+EQUIVALENT = 0.05
 _MOST_ALTERNATIVES = 12
-# Simpler members of a family, and the gain in the logarithm of held-out errors that does not
-# justify more parameters.
+# Simpler members of a family.
 _SIMPLER = {
     "stribeck_friction": "coulomb_friction",
     "load_dependent_friction": "coulomb_friction",
@@ -33,50 +23,8 @@ _SIMPLER = {
     "concave_friction": "viscous_friction",
     "directional_gain": "torque_gain",
 }
-_NO_MATTER = 0.02
 # Least share of a column's power in the training folds: below it, ridge regression overestimates.
 _SOME = 0.02
-
-
-def drop_negligible(p: Problem, keys: list[int]) -> list[int]:
-    """Remove members with a negligible force, unless they explain most of what the others leave."""
-    held = p.held_out(keys)
-    kept: set[int] = set()
-    while keys:
-        own = [i in p.always or i in kept for i in keys]
-        share = np.where(own, 1.0, p.force_shares(keys))
-        worst = int(np.argmin(share))
-        if share[worst] > _MATERIAL:
-            break
-        rest = [i for i in keys if i != keys[worst]]
-        without = p.held_out(rest)
-        if (
-            share[worst] > _TRACE
-            and held_out_gain(p, without, held, keys[worst])[0] > _MOST_OF_THE_REST
-        ):
-            kept.add(keys[worst])
-        else:
-            keys, held = rest, without
-    return keys
-
-
-def drop_unconfirmed(p: Problem, keys: list[int]) -> list[int]:
-    """Remove members, the least significant first, until all lower held-out errors."""
-    while keys:
-        held = p.held_out(keys)
-        t = [
-            np.inf
-            if i in p.always
-            else held_out_gain(p, p.held_out([m for m in keys if m != i]), held, i)[1]
-            for i in keys
-        ]
-        # The rarer a cause is, the surer it has to be.
-        short = [x - (_CONFIRMED + _RARE * p.rarity[i]) for i, x in zip(keys, t, strict=True)]
-        if min(short) > 0.0:
-            break
-        rest = [i for i, x in zip(keys, short, strict=True) if x > min(short)]
-        keys = enforce_bounds(p, retune(p, rest))
-    return keys
 
 
 def retune(p: Problem, keys: list[int]) -> list[int]:
@@ -109,39 +57,6 @@ def simpler_items(p: Problem, i: int) -> list[int]:
     ]
 
 
-def simplify(p: Problem, keys: list[int]) -> list[int]:
-    """Replace a member by a simpler one of its family that predicts held-out data as well."""
-    for i in list(keys):
-        others = simpler_items(p, i)
-        if not others:
-            continue
-        rest = [m for m in keys if m != i]
-        held = p.held_out(keys)
-        gained, _ = held_out_gain(p, p.held_out(rest), held, i)
-        for other in others:
-            if not np.isfinite(p.score([*rest, other])):
-                continue
-            lost, t = held_out_gain(p, p.held_out([*rest, other]), held, i)
-            if t < _WORSE or lost < max(_NO_MATTER, _EQUIVALENT * gained):
-                keys = [*rest, other]
-    return keys
-
-
-def prefer_plausible(p: Problem, keys: list[int]) -> list[int]:
-    """
-    Among candidates that the data cannot distinguish, choose the one with the best prior odds.
-    """
-    for i in list(keys):
-        if i in p.always:
-            continue
-        rest, held = [m for m in keys if m != i], p.held_out(keys)
-        gained, _ = held_out_gain(p, p.held_out(rest), held, i)
-        others = [o for o in equivalents(p, keys, i, held, gained) if p.rarity[o] < p.rarity[i]]
-        if others:
-            keys = [*rest, min(others, key=lambda o: (p.rarity[o], p.score([*rest, o])))]
-    return keys
-
-
 def held_out_gain(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> tuple[float, float]:
     """
     :param without: held-out squared errors without a member, shape ``(folds, dof)``
@@ -155,30 +70,6 @@ def held_out_gain(p: Problem, without: np.ndarray, held: np.ndarray, i: int) -> 
     joint = joints[int(np.argmax(ratio.mean(0)[joints]))]
     x = ratio[:, joints].ravel() if p.place(i) == SHARED else ratio[:, joint]
     return float(x.mean()), float(x.mean() / (x.std(ddof=1) / np.sqrt(len(x)) + 1e-9))
-
-
-def split_hints(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]:
-    """
-    An effect that is no larger than the unexplained structure may be a part of that misfit.
-
-    :return: members that stand out, and hints
-    """
-    keys, hints = list(keys), []
-    while keys:
-        found, grams = p.solve(keys), p.grams
-        rss = np.maximum([found.weights @ g @ found.weights for g in grams.by_joint], 1e-12)
-        share = np.sqrt(rss / grams.effective) * grams.scale / (p.force * grams.gain)
-        left = share * np.sqrt(np.clip(predictable(p, keys), 0.0, 1.0))
-        ratio = []
-        for i in keys:
-            # Friction, which every joint has, may be smaller than rare effects.
-            least = _OUTSTANDING * (1.0 + min(p.rarity[i], _RAREST)) / (1.0 + _RAREST)
-            own = p.force_of(i, found) / p.force / np.maximum(left, 1e-6) / least
-            ratio.append(np.inf if i in p.always else float(np.max(own)))
-        if min(ratio) >= 1.0:
-            break
-        hints.append(keys.pop(int(np.argmin(ratio))))
-    return keys, hints
 
 
 def predictable(p: Problem, keys: Sequence[int]) -> np.ndarray:
@@ -227,7 +118,7 @@ def equivalents(
         trial = [*rest, other]
         if p.score(trial) < own + _CLOSE:
             lost, t = held_out_gain(p, p.held_out(trial), held, i)
-            few, surely = lost < _EQUIVALENT * gained, t >= _WORSE
+            few, surely = lost < EQUIVALENT * gained, t >= WORSE
             if few or (not surely and lost < _SAME * max(gained, 1e-3)):
                 yield other
 
