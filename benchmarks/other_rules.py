@@ -42,17 +42,17 @@ def answers_of(inquiry) -> dict[str, Answer]:
 
 
 def squares(search, point) -> float:
-    return float(np.sum((point.raw / search.noise) ** 2))
+    return float(np.sum((point.residual / search.noise) ** 2))
 
 
 def gain(search, start, kept) -> float:
-    before, after = (np.mean((x.raw[:, -1] / search.noise) ** 2) for x in (start.kept, kept))
+    before, after = (np.mean((x.residual[:, -1] / search.noise) ** 2) for x in (start.kept, kept))
     return float(1.0 - after / before)
 
 
 def by_bic(search, start, tried) -> Answer:
     """The lowest Bayesian information criterion, with every sample counted as independent."""
-    n = start.point.raw.size
+    n = start.point.residual.size
     before = squares(search, start.point)
 
     def criterion(t) -> float:

@@ -236,7 +236,7 @@ def by_simulation(twin: Any, data: Any, seed: int) -> list[str]:
     free = sorted({i for c in own for i in h.indices(c)})
     fitted = search.base(h.null, free)
     # What the fit leaves is the noise of each channel.
-    search = search.with_noise(np.sqrt(np.mean(fitted.point.raw**2, (0, 1))) + 1e-300)
+    search = search.with_noise(np.sqrt(np.mean(fitted.point.residual**2, (0, 1))) + 1e-300)
     every, point = search.pooled(search.refit(fitted))
     stderr = standard_errors(every, point, free)
     wide = stats.norm.ppf(0.5 + _CONFIDENCE / 2.0) * stderr

@@ -137,16 +137,16 @@ def test_causes_look_alike_at_one_place_only():
 
 
 def test_windows_that_the_twin_does_not_come_near_are_said():
-    raw = np.ones((6, 10, 2))
-    raw[4] = 30.0
+    residual = np.ones((6, 10, 2))
+    residual[4] = 30.0
     half = Half(SimpleNamespace(noise=np.ones(2)), np.arange(6), np.zeros(2))
 
     def said(error):
         return out_of_reach(half, Point(None, None, error, 0.0), np.array([0, 0, 1, 1, 2, 2]))
 
-    (sentence,) = said(raw)
+    (sentence,) = said(residual)
     assert "1 of 6 windows" in sentence and "(trajectory 2)" in sentence
-    assert not said(np.minimum(raw, 9.0))
+    assert not said(np.minimum(residual, 9.0))
 
 
 def swinging(*hidden, n=8, n_steps=120, strength=0.05):
@@ -373,7 +373,7 @@ def test_windows_of_both_halves_count_alike_where_all_the_data_choose():
     rng, noise, unminded = np.random.default_rng(0), np.array([0.1, 0.2]), np.array([0.01, 0.0])
     halves = [Half(SimpleNamespace(noise=noise), np.arange(n), unminded) for n in (5, 8)]
     before, after = (
-        [SimpleNamespace(raw=size * rng.standard_normal((n, 40, 2))) for n in (5, 8)]
+        [SimpleNamespace(residual=size * rng.standard_normal((n, 40, 2))) for n in (5, 8)]
         for size in (0.3, 0.2)
     )
 
@@ -384,7 +384,7 @@ def test_windows_of_both_halves_count_alike_where_all_the_data_choose():
         return ranking._of_all(tried, SimpleNamespace(point=before[a], kept=before[b]))
 
     def summed(points):
-        windows = np.concatenate([(point.raw / noise) ** 2 for point in points])
+        windows = np.concatenate([(point.residual / noise) ** 2 for point in points])
         return float((windows.mean((1, 2)) + np.mean((unminded / noise) ** 2)).sum())
 
     error, ahead = chosen(0, 1)
@@ -462,7 +462,7 @@ def test_every_window_begins_with_what_happened_before_it(effect):
     theta = hypotheses.null.copy()
     theta[list(hypotheses.indices(candidate))] = list(effect.values.values())
 
-    np.testing.assert_allclose(evidence.fit(theta, ()).raw, 0.0, atol=1e-5)
+    np.testing.assert_allclose(evidence.fit(theta, ()).residual, 0.0, atol=1e-5)
 
 
 def test_a_guess_stays_within_its_room():

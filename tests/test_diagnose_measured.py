@@ -37,7 +37,7 @@ def error_over(twin, data, seconds):
     evidence = Evidence(
         hypotheses, shots, channel_deviations(data), 1, portion=portion_for(shots.n)
     )
-    return np.sqrt(np.mean(evidence.fit(hypotheses.null, (), n_steps=25).raw ** 2))
+    return np.sqrt(np.mean(evidence.fit(hypotheses.null, (), n_steps=25).residual ** 2))
 
 
 def rollout_error(twin, data, seconds):

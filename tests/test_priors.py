@@ -42,8 +42,8 @@ def test_noise_is_distinguished_from_a_smooth_motion():
 
 def test_large_deviations_are_reported_in_the_unit_of_the_channel_and_as_shares():
     channels = Channel("angle", "rad"), Channel("speed", "rad/s")
-    raw = np.broadcast_to([0.5, 0.02], (4, 10, 2))
-    found = distances(channels, raw, np.array([0.01, 0.01]), np.array([1.0, 1.0]))
+    residual = np.broadcast_to([0.5, 0.02], (4, 10, 2))
+    found = distances(channels, residual, np.array([0.01, 0.01]), np.array([1.0, 1.0]))
 
     assert [one.near for one in found] == [False, True]
     assert "angle by 0.5 rad, 50% of its standard deviation" in far_in_words(found)
@@ -53,8 +53,8 @@ def test_large_deviations_are_reported_in_the_unit_of_the_channel_and_as_shares(
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 def test_deviations_are_as_large_whatever_the_unit(unit):
     channels = (Channel("angle", "rad"),)
-    raw = np.full((4, 10, 1), 0.5)
-    raw[0, 5] = np.nan
-    (found,) = distances(channels, unit * raw, unit * np.array([0.01]), unit * np.array([1.0]))
+    residual = np.full((4, 10, 1), 0.5)
+    residual[0, 5] = np.nan
+    (found,) = distances(channels, unit * residual, unit * np.array([0.01]), unit * np.array([1.0]))
 
     assert found.error == pytest.approx(unit * np.sqrt((39 * 0.25 + 1e6) / 40))

@@ -75,7 +75,7 @@ def open_answers(
             ([*own, tried.candidate], search.believing(tried, base))
             for tried in search.fit(nearest, base)
         ]
-    n_effective = effective_size(base.kept.raw / search.noise)
+    n_effective = effective_size(base.kept.residual / search.noise)
     least = min(search.confirm.total(one.kept) for _, one in sets)
     answers = []
     for candidates, one in sets:
@@ -86,8 +86,8 @@ def open_answers(
     return Answers(
         tuple(_answer(search, weight, causes, one, extended) for weight, causes, one in answers),
         np.asarray(search.noise, float),
-        every * max(base.kept.raw.size / n_effective, 1.0),
-        every * (base.kept.raw.shape[1] - 1),
+        every * max(base.kept.residual.size / n_effective, 1.0),
+        every * (base.kept.residual.shape[1] - 1),
         _slowest(h.believed, data),
     )
 

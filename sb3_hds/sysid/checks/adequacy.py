@@ -46,17 +46,17 @@ class Distance(NamedTuple):
 
 def distances(
     channels: Sequence[Channel],
-    raw: Float[np.ndarray, "n rows obs"],
+    residual: Float[np.ndarray, "n rows obs"],
     noise: Float[np.ndarray, " obs"],
     deviations: Float[np.ndarray, " obs"],
 ) -> tuple[Distance, ...]:
     """
-    :param raw: simulated minus measured
+    :param residual: simulated minus measured
     :param noise: of each channel
     :param deviations: standard deviation of each channel
     """
     most = (_DIVERGED * deviations) ** 2
-    squares = np.minimum(np.nan_to_num(raw**2, nan=np.inf, posinf=np.inf), most)
+    squares = np.minimum(np.nan_to_num(residual**2, nan=np.inf, posinf=np.inf), most)
     errors = np.sqrt(np.mean(squares, axis=(0, 1)))
     return tuple(
         Distance(channel, float(e), float(n), float(s))

@@ -192,7 +192,7 @@ def _changed(motion: Motion, change: _Change) -> Motion:
             change.q(r.q),
             change.slopes(r.v),
             change.slopes(r.a),
-            change.slopes(r.raw),
+            change.slopes(r.measured_v),
             change.actions(r.actions),
         )
         for r in motion.recordings
@@ -218,6 +218,6 @@ def _fewer(motion: Motion, most: int = _ROWS) -> Motion:
     kept = []
     for r in motion.recordings:
         rows = max(int(len(r.actions) * most / n), min(len(r.actions), 50))
-        q, v, a, raw = (x[: rows + 1] for x in r[:4])
-        kept.append(JointMotion(q, v, a, raw, r.actions[:rows]))
+        q, v, a, measured_v = (x[: rows + 1] for x in r[:4])
+        kept.append(JointMotion(q, v, a, measured_v, r.actions[:rows]))
     return motion._replace(recordings=tuple(kept))

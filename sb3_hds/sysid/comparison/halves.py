@@ -35,7 +35,7 @@ class Half(NamedTuple):
         """
         own = slice(None) if channels is None else list(channels)
         noise = self.evidence.noise[own]
-        errors = np.mean((point.raw[..., own] / noise) ** 2, (1, 2))
+        errors = np.mean((point.residual[..., own] / noise) ** 2, (1, 2))
         errors = np.nan_to_num(errors, nan=NOT_FINITE, posinf=NOT_FINITE)
         return errors + float(np.mean((self.irrelevant[own] / noise) ** 2))
 

@@ -165,12 +165,14 @@ def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split
     return Split(cluster, held_out)
 
 
-def effective_size(raw: Float[np.ndarray, "n rows obs"]) -> float:
+def effective_size(residual: Float[np.ndarray, "n rows obs"]) -> float:
     """:return: effective sample size of these errors, by their lag-one autocorrelation"""
-    before, after = raw[:, :-1], raw[:, 1:]
-    power = np.sum(raw**2, (0, 1)) + 1e-300
+    before, after = residual[:, :-1], residual[:, 1:]
+    power = np.sum(residual**2, (0, 1)) + 1e-300
     correlation = np.clip(np.sum(before * after, (0, 1)) / power, 0.0, 0.999)
-    return float(raw.shape[0] * raw.shape[1] * np.sum((1 - correlation) / (1 + correlation)))
+    return float(
+        residual.shape[0] * residual.shape[1] * np.sum((1 - correlation) / (1 + correlation))
+    )
 
 
 def _in_blocks(origin: np.ndarray, recordings: np.ndarray) -> np.ndarray:

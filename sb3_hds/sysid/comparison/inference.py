@@ -79,7 +79,7 @@ def detectable(half: Half, point: Point) -> dict[str, dict[str, float]]:
         that counts, to first order
     """
     h, total = half.evidence.hypotheses, half.evidence.slopes(point).curvature.sum(0)
-    numbers = point.raw.shape[1] * point.raw.shape[2]
+    numbers = point.residual.shape[1] * point.residual.shape[2]
     needed = 0.5 * LEAST_GAIN * half.total(point) * numbers
     nuisances, found = list(h.nuisances), {}
     inner = np.linalg.pinv(total[np.ix_(nuisances, nuisances)], rcond=_RANK)
@@ -106,7 +106,7 @@ def detectable_sizes(
     :param by_equation: what the equation of motion shows, by candidate and parameter
     """
     found = detectable(half, point)
-    left = float(np.mean((point.raw / half.evidence.noise) ** 2, (1, 2)).sum())
+    left = float(np.mean((point.residual / half.evidence.noise) ** 2, (1, 2)).sum())
     larger = np.sqrt(half.total(point) / left) if left > 0.0 else 1.0
     for key, sizes in by_equation.items():
         simulated = {n: x for n, x in found.get(key, {}).items() if np.isfinite(x)}

@@ -93,7 +93,7 @@ class Ranking(NamedTuple):
 
     def criterion(self, candidates: Sequence[Candidate], point: Point, base: Point) -> float:
         """:return: by which the information criterion is lower with these candidates"""
-        n = effective_size(base.raw / self.select.evidence.noise)
+        n = effective_size(base.residual / self.select.evidence.noise)
         before, after = map(self.select.total, (base, point))
         return information_gain(before, after, n, sum(len(c.parameters) for c in candidates))
 
@@ -106,8 +106,8 @@ class Ranking(NamedTuple):
         """:return: as :meth:`compare`, of nested models"""
         comparison = self.compare(new, old)
         by_score = by_scores(
-            new.raw / self.select.evidence.noise,
-            old.raw / self.select.evidence.noise,
+            new.residual / self.select.evidence.noise,
+            old.residual / self.select.evidence.noise,
             self.confirm.cluster,
         )
         return comparison._replace(p_value=min(comparison.p_value, by_score))
@@ -117,7 +117,7 @@ class Ranking(NamedTuple):
         :return: error on both halves, with the parameters fitted to the first; and the criterion
         """
         n = sum(
-            effective_size(point.raw / self.select.evidence.noise)
+            effective_size(point.residual / self.select.evidence.noise)
             for point in (base.point, base.kept)
         )
         before, after = (

@@ -51,10 +51,10 @@ def sized(evidence: Evidence, data: Trajectories) -> Hypotheses:
             "that it is given, so nothing that they do could be found. sb3_hds.core.AnalyticTwin "
             "has a step that does."
         )
-    seen = curvature > _NOTHING * point.raw.size
+    seen = curvature > _NOTHING * point.residual.size
     moved = _motion(h, data)
     scale = np.where(seen, h.scale, _unseen(h, data, moved))
-    scale[seen] *= _SHARE * np.sqrt(point.raw.size / curvature[seen])
+    scale[seen] *= _SHARE * np.sqrt(point.residual.size / curvature[seen])
     # Without a slope a parameter may be a switch, which a tenth of its range does not turn.
     most = np.where(seen, _OF_RANGE, 1.0) * (h.upper - h.lower)
     return dataclasses.replace(h, scale=np.minimum(scale, most), starts=_starts(h, moved))

@@ -242,7 +242,7 @@ def _each_left_out(
     half, some = search.confirm, evenly(search.confirm.evidence.shots.n, _SOME_WINDOWS)
     shots = half.evidence.shots.rows(some)
     half = half._replace(evidence=half.evidence.on(shots), cluster=half.cluster[some])
-    kept = base.kept._replace(offsets=base.kept.offsets[some], raw=base.kept.raw[some])
+    kept = base.kept._replace(offsets=base.kept.offsets[some], residual=base.kept.residual[some])
 
     def left_out(key: str) -> Comparison:
         theta = _sizes_with(search, screened, start, members.keys() - {key})

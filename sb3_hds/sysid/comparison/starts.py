@@ -67,7 +67,7 @@ def guesses(
     h, point = here.evidence.hypotheses, here.point
     slopes = here.evidence.slopes(point)
     curvature, score = slopes.curvature.sum(0), slopes.scores.sum(0)
-    flat = np.diag(curvature) < _FLAT * point.raw.size
+    flat = np.diag(curvature) < _FLAT * point.residual.size
     room = _room(here, point.theta)
 
     def guess(candidate: Candidate) -> Guess:

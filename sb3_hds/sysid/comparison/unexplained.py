@@ -166,8 +166,8 @@ def _left_by_forces(short: ShortWindows, slopes: Slopes) -> Float[np.ndarray, " 
     was measured over long windows, where what is missing has had time to grow.
     """
     measured = short.shots.obs.shape[1]
-    raw = np.nan_to_num(short.point.raw[:, :measured], nan=0.0)
-    whole = np.sum((raw / short.evidence.noise) ** 2, (1, 2))
+    residual = np.nan_to_num(short.point.residual[:, :measured], nan=0.0)
+    whole = np.sum((residual / short.evidence.noise) ** 2, (1, 2))
     inverse = np.linalg.pinv(slopes.curvature, hermitian=True)
     gained = np.einsum("ni,nij,nj->n", slopes.scores, inverse, slopes.scores)
     return np.maximum(whole - gained, 0.0)

@@ -279,10 +279,10 @@ def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int,
     :param every: steps of the data in one of the windows
     :return: errors some steps ahead, by the number of steps of the data
     """
-    found, last = {}, before.raw.shape[1] - 1
+    found, last = {}, before.residual.shape[1] - 1
     for ahead in sorted({1, max(last // 4, 1), last}):
         old, new = (
-            bounded(np.mean((point.raw[:, ahead] / half.evidence.noise) ** 2, 1))
+            bounded(np.mean((point.residual[:, ahead] / half.evidence.noise) ** 2, 1))
             for point in (before, after)
         )
         gained = t_test(new, old, half.cluster)

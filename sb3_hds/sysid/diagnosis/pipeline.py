@@ -250,7 +250,9 @@ class Inquiry:
 
     def _set_noise(self, point: Point) -> None:
         most = _WORST * self.given.spread
-        error = np.minimum(np.where(np.isfinite(point.raw), np.abs(point.raw), np.inf), most)
+        error = np.minimum(
+            np.where(np.isfinite(point.residual), np.abs(point.residual), np.inf), most
+        )
         noise = np.mean(error**2, (0, 1)) + (IRRELEVANT * self.given.spread) ** 2
         self._use(self.search.with_noise(np.sqrt(noise)))
 
@@ -308,8 +310,12 @@ class Inquiry:
 
     def _far_off(self, base: Base) -> str:
         """:return: a sentence on how far held-out windows are from what is believed, if they are"""
-        raw = self.search.confirm.evidence.fit(base.point.theta, (), base.kept.offsets).raw
-        found = distances(self.believed.channels, raw, self.given.sensor_noise, self.given.spread)
+        residual = self.search.confirm.evidence.fit(
+            base.point.theta, (), base.kept.offsets
+        ).residual
+        found = distances(
+            self.believed.channels, residual, self.given.sensor_noise, self.given.spread
+        )
         return far_in_words(found)
 
     def _result(

@@ -104,7 +104,7 @@ def _rows(motion: Motion) -> Rows:
             r.v[:-1],
             0.5 * (r.a[1:] + r.a[:-1]),
             np.diff(r.v, axis=0),
-            np.diff(r.raw, axis=0),
+            np.diff(r.measured_v, axis=0),
             r.actions,
             np.full(len(r.actions), i),
             r.q[1:],

@@ -166,7 +166,7 @@ def fit_windows(
         threshold=threshold,
     )
     at = evidence.fit(nominal_values(twin, free), (), n_steps=_FIRST_STEPS)
-    before, found = at.raw, None
+    before, found = at.residual, None
     if elsewhere is not None and np.any(_rms(before) > deviations):
         other = elsewhere()
         there = other and evidence.fit(other.values, (), n_steps=_FIRST_STEPS)
@@ -175,17 +175,17 @@ def fit_windows(
     for _ in range(_PASSES):
         found = evidence.solve(at.theta, range(len(free)), at.offsets, max_steps, least=_LEAST_STEP)
         at = found.point
-        noise = _noise(at.raw, len(free), n_free(twin), deviations)
+        noise = _noise(at.residual, len(free), n_free(twin), deviations)
         evidence = evidence.with_noise(noise)
     assert found is not None
     at = evidence.fit(at.theta, (), at.offsets, n_steps=_FIRST_STEPS)
     slopes, scale = evidence.slopes(at), evidence.hypotheses.scale
-    n_measured = at.raw.size - n_free(twin) * len(at.raw)
+    n_measured = at.residual.size - n_free(twin) * len(at.residual)
     uncertainty = covariance_of(
         slopes.curvature.sum(0), slopes.scores, origin, scale, prior, n_measured
     )
     solver = {"noise": noise, "converged": found.converged, "n_steps": found.n_steps}
-    return _result(twin, free, at.theta, uncertainty, level, (before, at.raw), **solver)
+    return _result(twin, free, at.theta, uncertainty, level, (before, at.residual), **solver)
 
 
 def _fit_forces(
@@ -224,7 +224,7 @@ def _fit_forces(
         errors.size,
     )
     before, after = (
-        evidence.fit(values, (), n_steps=_FIRST_STEPS).raw
+        evidence.fit(values, (), n_steps=_FIRST_STEPS).residual
         for values in (nominal_values(twin, free), found.values)
     )
     noise = _noise(after, 0, n_free(twin), deviations)
@@ -232,9 +232,9 @@ def _fit_forces(
     return _result(twin, free, found.values, uncertainty, level, (before, after), **solver)
 
 
-def _rms(raw: np.ndarray) -> np.ndarray:
+def _rms(residual: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore"):
-        return np.sqrt(np.mean(raw**2, (0, 1)))
+        return np.sqrt(np.mean(residual**2, (0, 1)))
 
 
 def default_window(data: Trajectories) -> int:
@@ -244,11 +244,11 @@ def default_window(data: Trajectories) -> int:
 
 
 def _noise(
-    raw: np.ndarray, n_params: int, n_start: int, deviations: np.ndarray
+    residual: np.ndarray, n_params: int, n_start: int, deviations: np.ndarray
 ) -> Float[np.ndarray, " obs"]:
     """Robust standard deviation of each channel's error, from the median."""
-    error = raw.reshape(-1, raw.shape[-1])
-    freedom = error.size / max(error.size - n_params - n_start * len(raw), 1)
+    error = residual.reshape(-1, residual.shape[-1])
+    freedom = error.size / max(error.size - n_params - n_start * len(residual), 1)
     noise = 1.4826 * np.median(np.abs(error), 0) * np.sqrt(freedom)
     return np.maximum(noise, _LEAST_NOISE * deviations)
 
@@ -259,11 +259,11 @@ def _result(
     values: np.ndarray,
     uncertainty: Uncertainty,
     level: float,
-    raw: tuple[np.ndarray, np.ndarray],
+    residuals: tuple[np.ndarray, np.ndarray],
     **solver: Any,
 ) -> Fit:
     """
-    :param raw: errors of simulations before and after, each of shape ``(n, rows, n_obs)``
+    :param residuals: simulated minus measured, before and after, each of shape ``(n, rows, n_obs)``
     :param solver: what :class:`Fit` says of the solver, and the noise
     """
     groups = tuple(free.values())
@@ -286,7 +286,7 @@ def _result(
                 at_bound=bool(room < _ON_BOUND * parameter.scale),
             )
         )
-    before, after = raw
+    before, after = residuals
     return Fit(
         twin=twin.with_parameters(**one_each(groups, values.tolist())),
         estimates=tuple(estimates),

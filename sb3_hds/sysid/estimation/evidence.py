@@ -62,13 +62,13 @@ class Point(NamedTuple):
 
     :param theta: all parameters that may move, shape ``(p,)``
     :param offsets: of the start states, shape ``(n, free)``
-    :param raw: simulated minus measured, shape ``(n, steps + 1, n_obs)``
+    :param residual: simulated minus measured, shape ``(n, steps + 1, n_obs)``
     :param cost: minus log likelihood with Huber's loss, plus the prior of the fitted parameters
     """
 
     theta: np.ndarray
     offsets: np.ndarray
-    raw: np.ndarray
+    residual: np.ndarray
     cost: float
 
 
@@ -200,7 +200,7 @@ class Evidence:
             if (gained and gained < enough * now.cost.sum() + least) or damping > _MOST_DAMPING:
                 converged = True
                 break
-        point = Point(theta, offsets, now.raw, float(now.cost.sum()) + prior_cost(theta))
+        point = Point(theta, offsets, now.residual, float(now.cost.sum()) + prior_cost(theta))
         return Solution(point, converged, taken)
 
     def slopes(self, point: Point, index: Sequence[int] | None = None) -> Slopes:
@@ -296,11 +296,11 @@ class Evidence:
                     h.chosen(theta, own),
                 )
                 found = [np.asarray(leaf)[:n] for leaf in found]
-            raw, by_start, by_theta = found
+            residual, by_start, by_theta = found
             slopes.append(by_theta)
         by_theta = np.concatenate(slopes, -1)[..., : len(index)]
-        counted = np.ones(raw.shape[1]) if self.rows is None else self.rows
-        return normal_equations(raw, by_start, by_theta, self.noise, counted, self.threshold)
+        counted = np.ones(residual.shape[1]) if self.rows is None else self.rows
+        return normal_equations(residual, by_start, by_theta, self.noise, counted, self.threshold)
 
 
 def in_threads(work: Callable[[_Given], _Told], given: Sequence[_Given]) -> Iterator[_Told]:

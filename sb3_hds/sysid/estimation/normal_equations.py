@@ -21,7 +21,7 @@ class Blocks(NamedTuple):
     Cost of windows with its derivatives by start state and parameters, of Gauss-Newton. Leaves have
     one row for each window.
 
-    :param raw: simulated minus measured, shape ``(n, rows, n_obs)``
+    :param residual: simulated minus measured, shape ``(n, rows, n_obs)``
     :param cost: shape ``(n,)``
     :param start_hessian: shape ``(n, free, free)``
     :param cross_hessian: by start state and parameters, shape ``(n, free, p)``
@@ -30,7 +30,7 @@ class Blocks(NamedTuple):
     :param gradient: by parameters in units of their scale, shape ``(n, p)``
     """
 
-    raw: np.ndarray
+    residual: np.ndarray
     cost: np.ndarray
     start_hessian: np.ndarray
     cross_hessian: np.ndarray
@@ -51,7 +51,7 @@ class Step(NamedTuple):
 # States that diverge count as errors of a fixed size: no warning is needed.
 @np.errstate(over="ignore", invalid="ignore")
 def normal_equations(
-    raw: np.ndarray,
+    residual: np.ndarray,
     by_start: np.ndarray,
     by_theta: np.ndarray,
     noise: np.ndarray,
@@ -61,16 +61,16 @@ def normal_equations(
     """
     Of Gauss-Newton with Huber's loss.
 
-    :param raw: simulated minus measured, shape ``(n, rows, n_obs)``
+    :param residual: simulated minus measured, shape ``(n, rows, n_obs)``
     :param by_start: its derivative by the start state, shape ``(n, rows, n_obs, free)``
     :param by_theta: by the parameters in units of their scale, shape ``(n, rows, n_obs, p)``
     :param noise: standard deviation of each channel's noise, shape ``(n_obs,)``
     :param counted: weight of each row, shape ``(rows,)``
     :param threshold: of Huber's loss, in units of the noise
     """
-    n = len(raw)
-    finite = np.isfinite(raw)
-    error = np.where(finite, raw / noise, _NOT_FINITE) * counted[:, None]
+    n = len(residual)
+    finite = np.isfinite(residual)
+    error = np.where(finite, residual / noise, _NOT_FINITE) * counted[:, None]
     size = np.abs(error)
     small = np.minimum(size, threshold)
     cost = np.sum(0.5 * small**2 + threshold * (size - small), (1, 2))
@@ -79,12 +79,12 @@ def normal_equations(
     start, theta = (
         np.where(np.isfinite(slopes), slopes, 0.0) * factor for slopes in (by_start, by_theta)
     )
-    numbers = raw[0].size
+    numbers = residual[0].size
     start, theta = (x.reshape(n, numbers, x.shape[-1]) for x in (start, theta))
     right = (weight * error).reshape(n, -1, 1)
     across = start.transpose(0, 2, 1)
     return Blocks(
-        raw=raw,
+        residual=residual,
         cost=cost,
         start_hessian=across @ start,
         cross_hessian=across @ theta,

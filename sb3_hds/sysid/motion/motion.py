@@ -36,14 +36,14 @@ class JointMotion(NamedTuple):
     :param q: smoothed positions [rad] or [m]
     :param v: smoothed velocities
     :param a: smoothed accelerations
-    :param raw: velocities as they were measured, or differences of positions
+    :param measured_v: velocities as they were measured, or differences of positions
     :param actions: held from row to row, shape ``(rows - 1, n_act)``
     """
 
     q: np.ndarray
     v: np.ndarray
     a: np.ndarray
-    raw: np.ndarray
+    measured_v: np.ndarray
     actions: np.ndarray
 
 
@@ -122,12 +122,12 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
     """
     velocity_time = velocity_time_of(twin)
     actions = [np.asarray(data.episode(i)[1], float) for i in range(len(data))]
-    raws = [(*pair, u) for pair, u in zip(joint_motion(twin, data), actions, strict=True)]
+    logged = [(*pair, u) for pair, u in zip(joint_motion(twin, data), actions, strict=True)]
     measured = measures_velocity(twin, data)
     expected = _by_the_model(twin, data)
     found = [
         _smoothed(q, v, measured, data.dt, velocity_time, known)
-        for (q, v, _), known in zip(raws, expected, strict=True)
+        for (q, v, _), known in zip(logged, expected, strict=True)
     ]
     values = [
         tuple(np.stack([getattr(c, name) for c in columns], 1) for name in ("q", "v", "a"))
@@ -141,12 +141,12 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
     every = min(every, max(1, int(data.lengths.min()) // _PER_PERIOD))
     every = min(every, -(-int(data.lengths.sum()) // _ENOUGH))
     recordings = []
-    for (q, v, commands), smoothed, known in zip(raws, values, expected, strict=True):
-        raw = v.copy()
+    for (q, v, commands), smoothed, known in zip(logged, values, expected, strict=True):
+        measured_v = v.copy()
         still = ~measured
         if still.any():
-            raw[:, still] = _differences(q, data.dt, velocity_time, known)[:, still]
-        recordings.append(_thinned(smoothed, raw, commands, every))
+            measured_v[:, still] = _differences(q, data.dt, velocity_time, known)[:, still]
+        recordings.append(_thinned(smoothed, measured_v, commands, every))
     noise_q, noise_v = mean("noise_q"), mean("noise_v")
     noise_v = np.where(measured, noise_v, np.sqrt(0.5 + 6.0 * velocity_time**2) * noise_q / data.dt)
     return Motion(
@@ -162,7 +162,7 @@ def motion(twin: Twin, data: Trajectories) -> Motion:
         np.maximum(np.ceil(0.5 * mean("half") / every), 2.0).astype(int),
         1.0 if velocity_time == 0.0 else 1.0 - 1.0 / (twin.substeps * every),
         np.array([2.0 * np.pi if joint.unit == "rad" else np.inf for joint in twin.joints]),
-        measured & kinematics([(q, v) for q, v, _ in raws], data.dt, period).agrees,
+        measured & kinematics([(q, v) for q, v, _ in logged], data.dt, period).agrees,
     )
 
 
@@ -239,16 +239,16 @@ def _differences(
 
 
 def _thinned(
-    smoothed: tuple[np.ndarray, ...], raw: np.ndarray, actions: np.ndarray, every: int
+    smoothed: tuple[np.ndarray, ...], measured_v: np.ndarray, actions: np.ndarray, every: int
 ) -> JointMotion:
     q, v, a = smoothed
     if every == 1:
-        return JointMotion(q, v, a, raw, actions)
+        return JointMotion(q, v, a, measured_v, actions)
     n = len(actions) // every
     rows = slice(0, n * every + 1, every)
     held = actions[: n * every].reshape(n, every, actions.shape[1]).mean(1)
     # A cubic through its neighbours: noise is averaged, motion is not.
-    averaged = np.stack([smooth_mean(x, every) for x in raw.T], 1)
+    averaged = np.stack([smooth_mean(x, every) for x in measured_v.T], 1)
     return JointMotion(q[rows], v[rows], a[rows], averaged[rows], held)
 
 

@@ -120,15 +120,15 @@ def pictures_of(
     rows = _shown(half.cluster)
     measured = np.asarray(evidence.shots.obs)[rows]
     errors = [
-        np.sqrt(np.mean(bounded((point.raw / evidence.noise) ** 2), (0, 2)))
+        np.sqrt(np.mean(bounded((point.residual / evidence.noise) ** 2), (0, 2)))
         for point in (before, after)
     ]
-    rms = np.sqrt(np.mean(after.raw**2, 0))
+    rms = np.sqrt(np.mean(after.residual**2, 0))
     return Pictures(
         channels=tuple((c.name, c.unit) for c in twin.channels),
         joints=tuple((j.name, "N" if j.unit == "m" else "N m") for j in twin.joints),
         actuators=tuple((a.name, a.unit) for a in twin.actuators),
-        replay=replay_of(measured, before.raw[rows], after.raw[rows], rms, twin.dt),
+        replay=replay_of(measured, before.residual[rows], after.residual[rows], rms, twin.dt),
         steps=every * np.arange(measured.shape[1]),
         errors=np.stack(errors),
         missing=missing,
