@@ -419,7 +419,9 @@ def oracle(inquiry: Any, case: Case) -> float:
             theta[i] = theta[i] if value is None else value
             free.append(i)
     best = search.base(theta, free)
-    before, after = (np.mean((x.kept.residual[:, -1] / search.noise) ** 2) for x in (start, best))
+    before, after = (
+        np.mean((x.held_out.residual[:, -1] / search.noise) ** 2) for x in (start, best)
+    )
     return float(1.0 - after / before)
 
 

@@ -46,7 +46,9 @@ def squares(search, point) -> float:
 
 
 def gain(search, start, kept) -> float:
-    before, after = (np.mean((x.residual[:, -1] / search.noise) ** 2) for x in (start.kept, kept))
+    before, after = (
+        np.mean((x.residual[:, -1] / search.noise) ** 2) for x in (start.held_out, kept)
+    )
     return float(1.0 - after / before)
 
 
@@ -62,15 +64,15 @@ def by_bic(search, start, tried) -> Answer:
     best = max(tried, key=criterion)
     if criterion(best) <= _STRONG:
         return Answer()
-    return Answer(best.candidate.key, gain(search, start, best.kept))
+    return Answer(best.candidate.key, gain(search, start, best.held_out))
 
 
 def by_held_out(search, start, tried) -> Answer:
     """The lowest error on held-out recordings, if it is lower at all."""
-    best = min(tried, key=lambda t: squares(search, t.kept))
-    if squares(search, best.kept) >= squares(search, start.kept):
+    best = min(tried, key=lambda t: squares(search, t.held_out))
+    if squares(search, best.held_out) >= squares(search, start.held_out):
         return Answer()
-    return Answer(best.candidate.key, gain(search, start, best.kept))
+    return Answer(best.candidate.key, gain(search, start, best.held_out))
 
 
 def by_parameters(search, h, start) -> Answer:
@@ -80,12 +82,12 @@ def by_parameters(search, h, start) -> Answer:
     own = [h.indices(c)[0] for c in h.candidates if c.slot == "parameter"]
     free = [*start.free, *own]
     fitted = search.base(start.point.theta, free)
-    if not own or squares(search, fitted.kept) > 0.95 * squares(search, start.kept):
+    if not own or squares(search, fitted.held_out) > 0.95 * squares(search, start.held_out):
         return Answer()
     stderr = standard_errors(search.select, fitted.point, free)
     moved = np.abs(fitted.point.theta - h.null)[own] / np.maximum(stderr[own], 1e-300)
     name = f"parameter.{h.names[own[int(np.argmax(moved))]]}"
-    return Answer(name, gain(search, start, fitted.kept))
+    return Answer(name, gain(search, start, fitted.held_out))
 
 
 def by_regression(inquiry, start) -> Answer:
@@ -125,7 +127,7 @@ def by_regression(inquiry, start) -> Answer:
         # The equation of motion left it out of what is simulated.
         return Answer(name)
     fitted = inquiry.search.base(start.point.theta, [*start.free, *chosen[0]])
-    return Answer(name, gain(inquiry.search, start, fitted.kept))
+    return Answer(name, gain(inquiry.search, start, fitted.held_out))
 
 
 def _sparse(matrix: np.ndarray, force: np.ndarray) -> np.ndarray:

@@ -303,7 +303,7 @@ def test_every_window_may_confirm_where_few_clusters_gain_unequally():
 
 def tried(name, criterion=60.0):
     candidate = SimpleNamespace(parameters=tuple(name.split()))
-    return SimpleNamespace(kept=name, criterion=criterion, candidate=candidate)
+    return SimpleNamespace(held_out=name, criterion=criterion, candidate=candidate)
 
 
 @each(
@@ -325,9 +325,9 @@ def test_a_confirmed_cause_is_replaced_only_by_a_simpler_confirmed_one_that_is_a
 
     ranking = SimpleNamespace(compare_nested=confirmed, compare=confirmed)
 
-    best = Ranking.best(ranking, [*map(tried, p_values)], SimpleNamespace(kept="base"))
+    best = Ranking.best(ranking, [*map(tried, p_values)], SimpleNamespace(held_out="base"))
 
-    assert best.kept == chosen
+    assert best.held_out == chosen
 
 
 @each(
@@ -349,10 +349,10 @@ def test_of_what_is_confirmed_all_the_data_choose_but_more_freedom_has_to_be_sur
     )
 
     best = Ranking.best_on_pooled_data(
-        ranking, first, [first, second], SimpleNamespace(kept="base")
+        ranking, first, [first, second], SimpleNamespace(held_out="base")
     )
 
-    assert best.kept == chosen
+    assert best.held_out == chosen
 
 
 @each((0, "gain"), (1, "tau_c"))
@@ -362,11 +362,11 @@ def test_what_replaces_a_later_cause_is_confirmed_at_the_same_level(n_found, cho
         compare_nested=lambda new, _: Comparison(0.5, 0.02, 0.2, 0.7, 6),
         _of_all=lambda one, _: (0.99, 51.0) if one is second else (1.0, 50.0),
     )
-    base = SimpleNamespace(kept="base")
+    base = SimpleNamespace(held_out="base")
 
     best = Ranking.best_on_pooled_data(ranking, first, [first, second], base, n_found)
 
-    assert best.kept == chosen
+    assert best.held_out == chosen
 
 
 def test_windows_of_both_halves_count_alike_where_all_the_data_choose():
@@ -379,9 +379,9 @@ def test_windows_of_both_halves_count_alike_where_all_the_data_choose():
 
     def chosen(a, b, parameters=("tau_c",)):
         ranking = Ranking(halves[a], halves[b])
-        tried = SimpleNamespace(point=after[a], kept=after[b])
+        tried = SimpleNamespace(point=after[a], held_out=after[b])
         tried.candidate = SimpleNamespace(parameters=parameters)
-        return ranking._of_all(tried, SimpleNamespace(point=before[a], kept=before[b]))
+        return ranking._of_all(tried, SimpleNamespace(point=before[a], held_out=before[b]))
 
     def summed(points):
         windows = np.concatenate([(point.residual / noise) ** 2 for point in points])

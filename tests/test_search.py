@@ -37,7 +37,7 @@ def test_a_second_answer_is_the_first_whatever_was_asked_in_between(searched):
     assert [t.candidate.key for t in again] == [t.candidate.key for t in first]
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one.point.theta, other.point.theta)
-        np.testing.assert_array_equal(one.kept.residual, other.kept.residual)
+        np.testing.assert_array_equal(one.held_out.residual, other.held_out.residual)
 
 
 def test_fits_begin_where_they_are_told_to(searched):
@@ -65,7 +65,7 @@ def test_intervals_of_several_causes_are_no_narrower_than_models_are_exact(searc
     every, point = searched.pooled(searched.believing(best, start))
     free = searched.hypotheses.indices(best.candidate)
     exact = {name: (2.0, 2.0, 2.0) for name in best.candidate.parameters}
-    verdict = searched.ranking.compare(best.kept, start.kept)
+    verdict = searched.ranking.compare(best.held_out, start.held_out)
     alone = Accepted(best, verdict, (), 0.0)
     among = alone._replace(sizes=exact, of_equation=of_equation)
     if not of_equation:
@@ -84,7 +84,7 @@ def test_a_member_of_a_set_is_the_best_of_all_candidates_also_of_those_not_simul
     candidate = SimpleNamespace(key="cogging.hinge")
     member = SimpleNamespace(t=4.0, gain=30.0, others=())
     screened = SimpleNamespace(hypotheses=SimpleNamespace(candidates=range(40)))
-    base = SimpleNamespace(point=None, kept=None)
+    base = SimpleNamespace(point=None, held_out=None)
     judged = several._Judged(screened, base, {candidate.key: None}, {})
     search = SimpleNamespace(hypotheses=SimpleNamespace(candidates=range(5)))
 

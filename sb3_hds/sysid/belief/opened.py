@@ -75,19 +75,19 @@ def open_answers(
             ([*own, tried.candidate], search.believing(tried, base))
             for tried in search.fit(nearest, base)
         ]
-    n_effective = effective_size(base.kept.residual / search.noise)
-    least = min(search.confirm.total(one.kept) for _, one in sets)
+    n_effective = effective_size(base.held_out.residual / search.noise)
+    least = min(search.confirm.total(one.held_out) for _, one in sets)
     answers = []
     for candidates, one in sets:
-        likelihood = -0.5 * n_effective * np.log(search.confirm.total(one.kept) / least)
+        likelihood = -0.5 * n_effective * np.log(search.confirm.total(one.held_out) / least)
         odds = -sum(rarity_of(c, h.twin) for c in candidates)
         answers.append((likelihood + odds, candidates, one))
     answers = sorted(answers, key=lambda answer: -answer[0])[:MOST]
     return Answers(
         tuple(_answer(search, weight, causes, one, extended) for weight, causes, one in answers),
         np.asarray(search.noise, float),
-        every * max(base.kept.residual.size / n_effective, 1.0),
-        every * (base.kept.residual.shape[1] - 1),
+        every * max(base.held_out.residual.size / n_effective, 1.0),
+        every * (base.held_out.residual.shape[1] - 1),
         _slowest(h.believed, data),
     )
 

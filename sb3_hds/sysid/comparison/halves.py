@@ -48,12 +48,12 @@ class Base(NamedTuple):
     The current model: the nominal one with the causes accepted so far.
 
     :param point: fitted to the windows for selection
-    :param kept: the same parameters on the other windows, start states refitted
+    :param held_out: the same parameters on the other windows, start states refitted
     :param free: indices of the parameters that are refitted under every hypothesis
     """
 
     point: Point
-    kept: Point
+    held_out: Point
     free: tuple[int, ...]
 
 
@@ -63,13 +63,13 @@ class Tried(NamedTuple):
 
     :param candidate: which
     :param point: the best that was found on the windows for selection
-    :param kept: the same parameters on the other windows, start states refitted
+    :param held_out: the same parameters on the other windows, start states refitted
     :param criterion: by which the information criterion is lower than without it
     """
 
     candidate: Candidate
     point: Point
-    kept: Point
+    held_out: Point
     criterion: float
 
 

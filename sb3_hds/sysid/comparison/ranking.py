@@ -46,10 +46,12 @@ class Ranking(NamedTuple):
         simplest = likely[0]
         for other in likely[1:]:
             if has_more_freedom(simplest, other):
-                simplest = other if as_good(self.compare(simplest.kept, other.kept)) else simplest
+                simplest = (
+                    other if as_good(self.compare(simplest.held_out, other.held_out)) else simplest
+                )
         level = LEVEL / (1 + n_found)
         for one in [simplest, *(t for t in likely if t is not simplest)][:_MOST_LOOKS]:
-            if passes(self.compare_nested(one.kept, base.kept), level):
+            if passes(self.compare_nested(one.held_out, base.held_out), level):
                 return one
             level *= 0.5
         return None
@@ -75,7 +77,9 @@ class Ranking(NamedTuple):
                 ahead > most
                 and not has_more_freedom(first, other)
                 and (surely or not has_more_freedom(other, first))
-                and passes(self.compare_nested(other.kept, base.kept), LEVEL / (1 + n_found))
+                and passes(
+                    self.compare_nested(other.held_out, base.held_out), LEVEL / (1 + n_found)
+                )
             ):
                 best, most = other, ahead
         return best
@@ -86,9 +90,9 @@ class Ranking(NamedTuple):
             parameters
         """
         others = [t for t in tried if t is not best and not has_more_freedom(t, best)]
-        equal = [t for t in others if as_good(self.compare(best.kept, t.kept))]
+        equal = [t for t in others if as_good(self.compare(best.held_out, t.held_out))]
         return tuple(
-            t.candidate.key for t in equal if passes(self.compare_nested(t.kept, base.kept))
+            t.candidate.key for t in equal if passes(self.compare_nested(t.held_out, base.held_out))
         )
 
     def criterion(self, candidates: Sequence[Candidate], point: Point, base: Point) -> float:
@@ -118,9 +122,9 @@ class Ranking(NamedTuple):
         """
         n = sum(
             effective_size(point.residual / self.select.evidence.noise)
-            for point in (base.point, base.kept)
+            for point in (base.point, base.held_out)
         )
         before, after = (
-            self.select.total(one.point) + self.confirm.total(one.kept) for one in (base, tried)
+            self.select.total(one.point) + self.confirm.total(one.held_out) for one in (base, tried)
         )
         return after, information_gain(before, after, n, len(tried.candidate.parameters))

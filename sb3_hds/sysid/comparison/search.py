@@ -21,7 +21,7 @@ from sb3_hds.sysid.progress import Bar
 _MOST_FIRSTS = 4
 # Steps of fits to the end and of rough ones, and of start states alone: to the end, and for a rough
 # comparison.
-_ALL_STEPS, _FEW_STEPS, _KEPT_STEPS, _ROUGH_STEPS = 25, 8, 6, 1
+_ALL_STEPS, _FEW_STEPS, _HELD_OUT_STEPS, _ROUGH_STEPS = 25, 8, 6, 1
 _Given = TypeVar("_Given")
 _Told = TypeVar("_Told")
 
@@ -117,16 +117,16 @@ class Search(NamedTuple):
         :param rival: fits that are far from it are given up
         :return: a model, ``free`` refitted from ``theta``
         """
-        begin = (None, None) if near is None else (near.point.offsets, near.kept.offsets)
-        most = (np.inf, np.inf) if rival is None else (rival.point.cost, rival.kept.cost)
+        begin = (None, None) if near is None else (near.point.offsets, near.held_out.offsets)
+        most = (np.inf, np.inf) if rival is None else (rival.point.cost, rival.held_out.cost)
         point = self.select.evidence.fit(theta, free, begin[0], rival=most[0])
-        kept = self.confirm.evidence.fit(point.theta, (), begin[1], rival=most[1])
-        return Base(point, kept, tuple(free))
+        held_out = self.confirm.evidence.fit(point.theta, (), begin[1], rival=most[1])
+        return Base(point, held_out, tuple(free))
 
     def believing(self, tried: Tried, base: Base) -> Base:
         """:return: the model with this candidate"""
         own = self.hypotheses.indices(tried.candidate)
-        return Base(tried.point, tried.kept, (*base.free, *own))
+        return Base(tried.point, tried.held_out, (*base.free, *own))
 
     def without(
         self,
@@ -147,10 +147,10 @@ class Search(NamedTuple):
 
     def refit(self, base: Base) -> Base:
         """:return: the same model, refitted with the current noise"""
-        point, kept = base.point, base.kept
+        point, held_out = base.point, base.held_out
         point = self.select.evidence.fit(point.theta, base.free, point.offsets)
-        kept = self.confirm.evidence.fit(point.theta, (), kept.offsets)
-        return Base(point, kept, base.free)
+        held_out = self.confirm.evidence.fit(point.theta, (), held_out.offsets)
+        return Base(point, held_out, base.free)
 
     def pooled(self, base: Base) -> tuple[Half, Point]:
         """:return: all windows, and the model fitted to them"""
@@ -159,7 +159,7 @@ class Search(NamedTuple):
         shots = Shots(*map(np.concatenate, zip(*shots, strict=True)))
         cluster = np.concatenate([half.cluster for half in pair])
         every = Half(self.select.evidence.on(shots), cluster, self.select.irrelevant)
-        offsets = np.concatenate([base.point.offsets, base.kept.offsets])
+        offsets = np.concatenate([base.point.offsets, base.held_out.offsets])
         return every, every.evidence.fit(base.point.theta, base.free, offsets)
 
     def fit_roughly(self, base: Base, accepted: Sequence[str]) -> list[Rough]:
@@ -232,10 +232,10 @@ class Search(NamedTuple):
             place = places[candidate.key]
             point = self._continued(candidate, base, place, rival, n_steps)
             if point.cost >= rival:
-                return Tried(candidate, point, base.kept, -np.inf)
-            kept = self._kept(place, point.theta, base.kept.offsets, _KEPT_STEPS)
+                return Tried(candidate, point, base.held_out, -np.inf)
+            held_out = self._held_out(place, point.theta, base.held_out.offsets, _HELD_OUT_STEPS)
             return Tried(
-                candidate, point, kept, self.ranking.criterion([candidate], point, base.point)
+                candidate, point, held_out, self.ranking.criterion([candidate], point, base.point)
             )
 
         tried = self._each(finish, candidates)
@@ -284,8 +284,8 @@ class Search(NamedTuple):
 
         def compared(candidate: Candidate) -> Comparison:
             place = self.places[candidate.key]
-            kept = self._kept(place, place.theta, base.kept.offsets, _ROUGH_STEPS)
-            return self.ranking.compare_nested(kept, base.kept)
+            held_out = self._held_out(place, place.theta, base.held_out.offsets, _ROUGH_STEPS)
+            return self.ranking.compare_nested(held_out, base.held_out)
 
         return list(zip(rest, self._each(compared, rest), strict=True))
 
@@ -313,7 +313,9 @@ class Search(NamedTuple):
 
     def needed(self, candidate: Candidate, base: Base) -> bool:
         """:return: whether the model is significantly worse without this candidate"""
-        return passes(self.ranking.compare_nested(base.kept, self.without(base, candidate).kept))
+        return passes(
+            self.ranking.compare_nested(base.held_out, self.without(base, candidate).held_out)
+        )
 
     def _continued(
         self, candidate: Candidate, base: Base, place: Place, rival: float, n_steps: int
@@ -350,7 +352,9 @@ class Search(NamedTuple):
         theta, offsets, _ = min(tried, key=lambda one: one[2])
         return theta, offsets
 
-    def _kept(self, place: Place, theta: np.ndarray, offsets: np.ndarray, n_steps: int) -> Point:
+    def _held_out(
+        self, place: Place, theta: np.ndarray, offsets: np.ndarray, n_steps: int
+    ) -> Point:
         """
         The start states of the half that confirms. Far from the model, they may be those of another
         motion.

@@ -56,7 +56,7 @@ def confirmed_set(
         none where the set as a whole does not predict better
     """
     members = _members(search, screened)
-    if not members or not passes(search.ranking.compare(base.kept, start.kept)):
+    if not members or not passes(search.ranking.compare(base.held_out, start.held_out)):
         return [], start
     many = len(members) > _MANY
     judged = (_judge_many if many else _judge_few)(search, screened, start, base)
@@ -102,7 +102,7 @@ def _judge_few(search: Search, screened: Screened, start: Base, base: Base) -> _
     while True:
         lost = _without_each(search, base, members)
         verdicts = {
-            key: _at_own_joint(search.confirm, members[key][0], base.kept, rest.kept)
+            key: _at_own_joint(search.confirm, members[key][0], base.held_out, rest.held_out)
             for key, rest in lost.items()
         }
         weak = [k for k, v in verdicts.items() if v.p_value >= _LEVEL or v.gain < _LEAST]
@@ -146,10 +146,10 @@ def _preferred(search: Search, rival: Tried, member: Candidate, base: Base) -> b
     """
     compare, twin = search.ranking.compare, search.hypotheses.believed
     more = len(rival.candidate.parameters) - len(member.parameters)
-    if more <= 0 and not as_good(compare(rival.kept, base.kept)):
+    if more <= 0 and not as_good(compare(rival.held_out, base.held_out)):
         return True
     rarer = rarity_of(rival.candidate, twin) - rarity_of(member, twin)
-    return more <= 0 and rarer < 0.0 and as_good(compare(base.kept, rival.kept))
+    return more <= 0 and rarer < 0.0 and as_good(compare(base.held_out, rival.held_out))
 
 
 def _judge_many(search: Search, screened: Screened, start: Base, base: Base) -> _Judged:
@@ -242,12 +242,14 @@ def _each_left_out(
     half, some = search.confirm, evenly(search.confirm.evidence.shots.n, _SOME_WINDOWS)
     shots = half.evidence.shots.rows(some)
     half = half._replace(evidence=half.evidence.on(shots), cluster=half.cluster[some])
-    kept = base.kept._replace(offsets=base.kept.offsets[some], residual=base.kept.residual[some])
+    held_out = base.held_out._replace(
+        offsets=base.held_out.offsets[some], residual=base.held_out.residual[some]
+    )
 
     def left_out(key: str) -> Comparison:
         theta = _sizes_with(search, screened, start, members.keys() - {key})
-        rest = half.evidence.fit(theta, (), kept.offsets, _ROUGH_STEPS)
-        return _at_own_joint(half, members[key][0], kept, rest)
+        rest = half.evidence.fit(theta, (), held_out.offsets, _ROUGH_STEPS)
+        return _at_own_joint(half, members[key][0], held_out, rest)
 
     found: list[Comparison] = list(search.bar.over(in_threads(left_out, keys), len(keys)))
     return dict(zip(keys, found, strict=True))
@@ -277,7 +279,9 @@ def _accepted(
 ) -> Accepted:
     tried, base = judged.rivals.get(key, ()), judged.base
     worse = {
-        t.candidate.key for t in tried if not as_good(search.ranking.compare(base.kept, t.kept))
+        t.candidate.key
+        for t in tried
+        if not as_good(search.ranking.compare(base.held_out, t.held_out))
     }
     # What is not simulated counts as equivalent where the equation says so.
     others = dict.fromkeys([*member.others, *(t.candidate.key for t in tried)])
@@ -286,7 +290,7 @@ def _accepted(
     n_candidates = len(judged.screened.hypotheses.candidates)
     p_value = float(scipy.stats.t.sf(member.t, _FREEDOM)) * n_candidates
     return Accepted(
-        Tried(candidate, base.point, base.kept, member.gain),
+        Tried(candidate, base.point, base.held_out, member.gain),
         judged.verdicts[key],
         tuple(equal),
         min(p_value, 1.0),

@@ -159,14 +159,14 @@ def look_alike(found: Sequence[Accepted], half: Half, base: Base) -> list[str]:
     return sentences
 
 
-def out_of_reach(half: Half, kept: Point, origin: Int[np.ndarray, " n"]) -> list[str]:
+def out_of_reach(half: Half, held_out: Point, origin: Int[np.ndarray, " n"]) -> list[str]:
     """
     :param half: held-out recordings
-    :param kept: the final model, on their windows
+    :param held_out: the final model, on their windows
     :param origin: recording of each window
     :return: a sentence on windows that the model does not predict at all, if there are any
     """
-    errors = np.sqrt(half.errors(kept))
+    errors = np.sqrt(half.errors(held_out))
     lost = errors > _LOST * max(float(np.median(errors)), 1.0)
     if not lost.any():
         return []

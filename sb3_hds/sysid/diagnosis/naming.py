@@ -155,7 +155,7 @@ class Naming:
             if self._predicts_better(best, base):
                 self.rejected_for |= dict.fromkeys(keys_of(place), NAMELESS)
                 rest = [one for one in found if one not in place]
-                better = self.search.ranking.compare(best.kept, base.kept)
+                better = self.search.ranking.compare(best.held_out, base.held_out)
                 return (
                     rest,
                     self.search.refit(without),
@@ -164,7 +164,7 @@ class Naming:
         return list(found), base, None
 
     def _predicts_better(self, force: Tried, base: Base) -> bool:
-        better = self.search.ranking.compare(force.kept, base.kept)
+        better = self.search.ranking.compare(force.held_out, base.held_out)
         return force.point.cost < base.point.cost and not as_good(better)
 
     def nameless(self, base: Base, known: Sequence[str]) -> Nameless | None:
@@ -179,7 +179,7 @@ class Naming:
             1 + len(known)
         ):
             return None
-        return Nameless(best, self.search.ranking.compare_nested(best.kept, base.kept), ())
+        return Nameless(best, self.search.ranking.compare_nested(best.held_out, base.held_out), ())
 
     def _confirmed(
         self,
@@ -199,7 +199,7 @@ class Naming:
         if second is None:
             return None
         both = self.search.believing(second.tried, belief)
-        if not passes(self.search.ranking.compare(both.kept, base.kept)):
+        if not passes(self.search.ranking.compare(both.held_out, base.held_out)):
             return None
         p_value = self._family_p_value(first, self.start, [])
         found, both = self._pruned(
@@ -246,7 +246,7 @@ class Naming:
         """:param base: what is believed without it"""
         rivals = [*tried, *self.search.fit_aliased(best, tried, base)]
         others = self.search.ranking.alternatives(best, rivals, base)
-        comparison = self.search.ranking.compare_nested(best.kept, base.kept)
+        comparison = self.search.ranking.compare_nested(best.held_out, base.held_out)
         fitted = tuple(t for t in rivals if t.candidate.key in others)
         return Accepted(best, comparison, others, p_value, rivals=fitted)
 
@@ -280,7 +280,9 @@ class Naming:
 
     def _is_small(self, best: Tried, base: Base) -> bool:
         """Whether the cause is negligible beside the earlier ones, whose model is not exact."""
-        first, now, then = map(self.search.confirm.total, (self.start.kept, base.kept, best.kept))
+        first, now, then = map(
+            self.search.confirm.total, (self.start.held_out, base.held_out, best.held_out)
+        )
         return now - then < _LEAST_OF_EARLIER * (first - now)
 
     def _family_p_value(self, best: Tried, base: Base, known: Sequence[str]) -> float:

@@ -189,7 +189,7 @@ class Inquiry:
         asked = [c for c in self.hypotheses.candidates if c.name in names]
         return any(
             t.point.cost < base.point.cost
-            and not as_good(self.search.ranking.compare(t.kept, base.kept))
+            and not as_good(self.search.ranking.compare(t.held_out, base.held_out))
             for t in self.search.fit(asked, start)
         )
 
@@ -198,7 +198,8 @@ class Inquiry:
     ) -> list[tuple[Candidate, Comparison]]:
         """:return: every candidate alone, on the half that confirms"""
         weighed = [
-            (t.candidate, self.search.ranking.compare_nested(t.kept, start.kept)) for t in firsts
+            (t.candidate, self.search.ranking.compare_nested(t.held_out, start.held_out))
+            for t in firsts
         ]
         return weighed + self.search.compare_rest(start, firsts)
 
@@ -311,7 +312,7 @@ class Inquiry:
     def _far_off(self, base: Base) -> str:
         """:return: a sentence on how far held-out windows are from what is believed, if they are"""
         residual = self.search.confirm.evidence.fit(
-            base.point.theta, (), base.kept.offsets
+            base.point.theta, (), base.held_out.offsets
         ).residual
         found = distances(
             self.believed.channels, residual, self.given.sensor_noise, self.given.spread
@@ -337,7 +338,7 @@ class Inquiry:
         )
         remains = "" if left.remainder is None else in_words(left.remainder)
         unexplained = " ".join(filter(None, (nearest, remains)))
-        gain = by_horizon(confirm, start.kept, base.kept, self.given.every)
+        gain = by_horizon(confirm, start.held_out, base.held_out, self.given.every)
         return Diagnosis(
             verdict=verdict_of(findings, unexplained),
             believed=self.believed,
@@ -360,7 +361,7 @@ class Inquiry:
                 *self._finer(),
                 *to_tell_apart(found, self.hypotheses),
                 *look_alike([one for one in found if not one.of_equation], select, base),
-                *out_of_reach(confirm, base.kept, self.given.origin[self.given.parts.held_out]),
+                *out_of_reach(confirm, base.held_out, self.given.origin[self.given.parts.held_out]),
                 *(errs_more(gain) if findings else ()),
             ),
             twin=self._extended(keys_of(found), point.theta),
@@ -368,8 +369,8 @@ class Inquiry:
             seed=self.seed,
             pictures=pictures_of(
                 confirm,
-                start.kept,
-                base.kept,
+                start.held_out,
+                base.held_out,
                 self.given.every,
                 before.missing,
                 left.missing,

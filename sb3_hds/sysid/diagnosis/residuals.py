@@ -116,7 +116,7 @@ class Residuals:
         if any(self.hypotheses.remembers(one.tried.candidate) for one in found):
             half, noise = self.search.confirm, left.missing.noise / self.search.noise
             floor = float(np.mean(noise**2)) * half.evidence.shots.n
-            wrong, rest = (half.total(point) - floor for point in (start.kept, base.kept))
+            wrong, rest = (half.total(point) - floor for point in (start.held_out, base.held_out))
             share = max(share, 1.0 - rest / wrong if 0.0 < rest < wrong else float(rest <= 0.0))
         return share
 
