@@ -400,7 +400,7 @@ def visible(screened: Any, truths: Sequence[str]) -> list[bool]:
 
     def left(items: Sequence[int]) -> float:
         rss = p.by_joint(p.solve([*p.always, *items]).weights, p.grams.by_joint)
-        n = p.grams.effective
+        n = p.grams.n_effective
         return float(np.sum(n * np.log(np.maximum(rss, 1e-9) / n)))
 
     whole = left([*chosen.values()])

@@ -97,7 +97,7 @@ def regression_of(screened: Any) -> Regression:
         )
     )
     nominal = terms(twin, twin.params, q, v, actions)
-    missing = np.einsum("nij,nj->ni", made.effective, change - nominal.change) / motion.dt
+    missing = np.einsum("nij,nj->ni", made.effective_inertia, change - nominal.change) / motion.dt
     unit = np.sqrt(np.mean(missing**2, axis=0)) + 1e-300
     columns, keys = [], []
     for item in _at_one_setting(made.items):

@@ -138,7 +138,7 @@ def _residual(hypotheses: Hypotheses, motion: Motion) -> tuple[np.ndarray, np.nd
     found = p.solve(keys)
     rss = p.by_joint(found.weights, p.grams.by_joint)
     floor = np.where(p.grams.floor > 0.0, p.grams.floor, 1.0)
-    return p.grams.effective, np.sqrt(rss / p.grams.effective) / floor
+    return p.grams.n_effective, np.sqrt(rss / p.grams.n_effective) / floor
 
 
 def _changes(twin: Twin) -> Iterator[_Change]:

@@ -47,20 +47,20 @@ def equation(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equ
     twin, rows = hypotheses.believed, _rows(motion)
     given = (twin, twin.params, rows.q, rows.v, rows.actions)
     found = terms(*given)
-    effective = found.mass if quick else effective_inertia(*given, found)
+    inertia = found.mass if quick else effective_inertia(*given, found)
     made = Equation(
         twin=twin,
         motion=motion,
         rows=rows,
         terms=found,
-        effective=effective,
+        effective_inertia=inertia,
         load=np.einsum("nij,nj->ni", found.mass, rows.a) + found.bias,
-        missing=residual_force(effective, rows.measured - found.change, motion.dt),
-        smooth=residual_force(effective, rows.change - found.change, motion.dt),
+        missing=residual_force(inertia, rows.measured - found.change, motion.dt),
+        smooth=residual_force(inertia, rows.change - found.change, motion.dt),
     )
     refuted = set() if quick else refuted_by_kinematics(twin, motion)
-    inertia = 1.0 / np.diagonal(np.linalg.inv(found.mass), axis1=1, axis2=2)
-    nodes = [nodes_of(made, inertia, j) for j in range(inertia.shape[1])]
+    of_joint = 1.0 / np.diagonal(np.linalg.inv(found.mass), axis1=1, axis2=2)
+    nodes = [nodes_of(made, of_joint, j) for j in range(of_joint.shape[1])]
     for candidate in hypotheses.candidates:
         effect = hypotheses.effect_of(candidate)
         if candidate.key in refuted:
@@ -122,10 +122,10 @@ def _add_parameter(made: Equation, candidate: Candidate) -> None:
     step = STEP * parameter.scale
     step = -step if value + step > parameter.upper else step
     there = terms(twin, {**twin.params, name: value + step}, rows.q, rows.v, rows.actions)
-    effective = made.effective + there.mass - now.mass
+    inertia = made.effective_inertia + there.mass - now.mass
 
     def column_of(change: np.ndarray, before: np.ndarray) -> np.ndarray:
-        after = residual_force(effective, change - there.change, made.motion.dt)
+        after = residual_force(inertia, change - there.change, made.motion.dt)
         return -(after - before) / step
 
     column = column_of(rows.change, made.smooth)
@@ -169,7 +169,8 @@ def problem(hypotheses: Hypotheses, equation: Equation) -> Problem:
         shares[own, c] = np.sqrt(np.mean(column.values**2, axis=0))
     force = np.sqrt(np.mean(equation.terms.actuator**2, axis=0))
     force = np.maximum(force, np.sqrt(np.mean(equation.load**2, axis=0))) + 1e-300
-    some = np.linspace(0, len(equation.effective) - 1, min(32, len(equation.effective))).astype(int)
+    n_rows = len(equation.effective_inertia)
+    some = np.linspace(0, n_rows - 1, min(32, n_rows)).astype(int)
     return Problem(
         items=items,
         grams=grams(equation),
@@ -180,7 +181,7 @@ def problem(hypotheses: Hypotheses, equation: Equation) -> Problem:
         shares=shares,
         passes=_passing(hypotheses, equation, items),
         mass=equation.terms.mass[some],
-        effective=equation.effective[some],
+        effective_inertia=equation.effective_inertia[some],
         noise=np.maximum(equation.motion.noise_v, _QUIETEST * equation.motion.speed.max()),
         noisy=equation.noisy,
         slopes={key: slope[some] for key, slope in equation.slopes.items()},

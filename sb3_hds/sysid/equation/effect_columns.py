@@ -101,7 +101,7 @@ def nodes_of(made: Equation, inertia: np.ndarray, joint: int) -> dict[str, np.nd
     half = _GAUSS[:, None]
     inside = np.concatenate([before * half, before + (1.0 - before) * half], axis=1)
     shares = np.concatenate([before, before, 1.0 - before, 1.0 - before], axis=1)
-    shares = shares * impulse_weights(made.terms.mass, made.effective, joint, inside)
+    shares = shares * impulse_weights(made.terms.mass, made.effective_inertia, joint, inside)
     s = motion.seen * inside
     # A cubic through both ends, of velocities a line.
     position = (2 * s**3 - 3 * s**2 + 1) * q + dt * (s**3 - 2 * s**2 + s) * v
@@ -301,8 +301,8 @@ def add_sensor(made: Equation, candidate: Candidate, effect: SensorEffect) -> No
     q, v = read(rows.q, rows.v)
     _, next_v = read(rows.next_q, rows.next_v)
     there = terms(twin, twin.params, q, v, rows.actions)
-    effective = made.effective + there.mass - made.terms.mass
-    after = residual_force(effective, next_v - v - there.change, made.motion.dt)
+    inertia = made.effective_inertia + there.mass - made.terms.mass
+    after = residual_force(inertia, next_v - v - there.change, made.motion.dt)
     column = -(after - made.smooth) / step
     if np.isfinite(column).all() and np.abs(column).max() > 0.0:
         index = put(made, None, column)

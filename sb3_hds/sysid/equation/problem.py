@@ -46,7 +46,7 @@ class Problem:
     :param passes: of saturations and dead zones, the share of commands that they pass
     :param mass: some mass matrices, shape ``(n, dof, dof)``
     :param noisy: of columns that contain the smoothed acceleration, the one with the measured one
-    :param effective: effective inertia over an interval, in the same rows
+    :param effective_inertia: over an interval, in the same rows
     :param noise: of each joint's acceleration, in any unit, shape ``(dof,)``
     :param slopes: of these by inertial parameters, by key
     :param drives: share of each joint's actuator force by parameters, by key
@@ -65,7 +65,7 @@ class Problem:
     shares: np.ndarray
     passes: dict[int, float]
     mass: np.ndarray
-    effective: np.ndarray
+    effective_inertia: np.ndarray
     noise: np.ndarray
     noisy: dict[int, int]
     slopes: dict[str, np.ndarray]
@@ -77,7 +77,7 @@ class Problem:
 
     @property
     def dof(self) -> int:
-        return len(self.grams.effective)
+        return len(self.grams.n_effective)
 
     @cached_property
     def total(self) -> np.ndarray:
@@ -87,7 +87,7 @@ class Problem:
     @cached_property
     def cost(self) -> float:
         """Penalty of one parameter: the logarithm of the effective number of rows."""
-        return float(np.log(self.grams.effective.mean()))
+        return float(np.log(self.grams.n_effective.mean()))
 
     def place(self, i: int) -> tuple[str, int]:
         """:return: slot and index"""
@@ -270,7 +270,7 @@ class Problem:
         if not self.admissible(keys, found):
             return np.inf
         rss = self.by_joint(self._with_measured_accelerations(found.weights), self.grams.by_joint)
-        n = self.grams.effective
+        n = self.grams.n_effective
         left = np.log(np.maximum(rss, 1e-9) / n) - self.lost_excitation(keys, found)
         prior = float(np.sum(self.prior[found.free] * found.theta**2))
         prices = sum(map(self.price, keys)) if priced else 0.0
@@ -329,7 +329,7 @@ class Problem:
             return np.full(self.dof, -np.inf)
         before, after = (
             np.mean(np.square(inertia * self.noise).sum(-1), axis=0)
-            for inertia in (self.effective, self.effective + change)
+            for inertia in (self.effective_inertia, self.effective_inertia + change)
         )
         return np.log(after / before)
 

@@ -158,7 +158,7 @@ class Equation:
     :param motion: from which it was made
     :param rows: of the motion
     :param terms: of the nominal model in these rows
-    :param effective: effective inertia over an interval, force over change of velocity with
+    :param effective_inertia: over an interval, force over change of velocity with
         damping, shape ``(n, dof, dof)``
     :param load: force that the nominal model transmits: inertia, gravity, shape ``(n, dof)``
     :param missing: residual force of the nominal model, shape ``(n, dof)`` [N m] or [N]
@@ -176,7 +176,7 @@ class Equation:
     motion: Motion
     rows: Rows
     terms: Terms
-    effective: np.ndarray
+    effective_inertia: np.ndarray
     load: np.ndarray
     missing: np.ndarray
     smooth: np.ndarray

@@ -296,7 +296,7 @@ def _split_hints(p: Problem, keys: Sequence[int]) -> tuple[list[int], list[int]]
     while keys:
         found, grams = p.solve(keys), p.grams
         rss = np.maximum([found.weights @ g @ found.weights for g in grams.by_joint], 1e-12)
-        share = np.sqrt(rss / grams.effective) * grams.scale / (p.force * grams.gain)
+        share = np.sqrt(rss / grams.n_effective) * grams.scale / (p.force * grams.gain)
         left = share * np.sqrt(np.clip(predictable(p, keys), 0.0, 1.0))
         ratio = []
         for i in keys:

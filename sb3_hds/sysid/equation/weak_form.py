@@ -96,7 +96,7 @@ def weak_rows(equation: Equation, j: int) -> Rows:
     widest = max(_WIDTH * period, _LEAST * motion.dt) / (2.0 * motion.dt)
     halves = [max(round(widest / 2**k), 2) for k in range(_NARROWEST)]
     halves = [n for n in halves if n >= _LEAST // 2] or halves[:1]
-    mass = float(np.median(equation.effective[:, j, j]))
+    mass = float(np.median(equation.effective_inertia[:, j, j]))
 
     def against(half: int, left_out: np.ndarray) -> Rows:
         projected, pieces = _against_bumps(table, equation.rows.recording, left_out, half)
@@ -224,7 +224,7 @@ class Grams(NamedTuple):
     :param blocks: shape ``(blocks, columns + 1, columns + 1)``; the last row is the missing force
     :param by_joint: shape ``(dof, columns + 1, columns + 1)``
     :param folds: of held-out data, shape ``(folds, dof, columns + 1, columns + 1)``
-    :param effective: number of independent rows of each joint
+    :param n_effective: number of independent rows of each joint
     :param floor: what the noise of velocities alone would leave of each joint's rows, in their unit
     :param scale: noise of a row of each joint [N m] or [N]
     :param gain: by which a constant force is larger in a row of each joint than at an instant
@@ -233,7 +233,7 @@ class Grams(NamedTuple):
     blocks: np.ndarray
     by_joint: np.ndarray
     folds: np.ndarray
-    effective: Float[np.ndarray, " dof"]
+    n_effective: Float[np.ndarray, " dof"]
     floor: Float[np.ndarray, " dof"]
     scale: Float[np.ndarray, " dof"]
     gain: Float[np.ndarray, " dof"]
@@ -255,7 +255,7 @@ def grams(equation: Equation) -> Grams:
     order = np.arange(n_blocks)
     fold_of = order % n_folds if pieces == 1 else order * n_folds // n_blocks
     folds = np.zeros((n_folds, dof, n_columns + 1, n_columns + 1))
-    effective, floor = np.full(dof, 5.0), np.zeros(dof)
+    n_effective, floor = np.full(dof, 5.0), np.zeros(dof)
     scale, gain = np.ones(dof), np.ones(dof)
     for j in range(dof):
         own = weak_rows(equation, j)
@@ -268,12 +268,12 @@ def grams(equation: Equation) -> Grams:
         rich = rich_columns(equation.items, own.used)
         deflation = _deflation(local, rich, _MOST_DEFLATION * own.narrowed)
         local = local / deflation
-        effective[j], floor[j] = max(len(own.y) / deflation, 5.0), own.floor
+        n_effective[j], floor[j] = max(len(own.y) / deflation, 5.0), own.floor
         for b in range(n_blocks):
             blocks[b][index] += local[b]
             folds[fold_of[b], j][index] += local[b]
         by_joint[j][index] = local.sum(0)
-    return Grams(blocks, by_joint, folds, effective, floor, scale, gain)
+    return Grams(blocks, by_joint, folds, n_effective, floor, scale, gain)
 
 
 def _deflation(local: np.ndarray, rich: np.ndarray, most: float) -> float:
