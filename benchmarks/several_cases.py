@@ -429,12 +429,12 @@ def _usual(system: str, noise: str, seen: str, loop: str) -> Usual:
 def _measured(system: str, noise: str, seen: str, loop: str) -> dict[str, Any]:
     from sb3_hds import effects
     from sb3_hds.sysid.equation.screening import screen
-    from sb3_hds.sysid.motion.motion import motion
+    from sb3_hds.sysid.motion.motion import smoothed_motion
 
     case = dataclasses.replace(nothing(system, noise), kind=SEVERAL, seen=seen, loop=loop)
     data, moved = _driven(case, 99)
     twin = nominal_twin(system, seen)
-    found = screen(twin, motion(twin, data), effects.ALL, ())
+    found = screen(twin, smoothed_motion(twin, data), effects.ALL, ())
     if found is None:
         raise RuntimeError(f"{system}: there is no equation of motion, so no size just shows.")
     dof = RIGS[system].dof

@@ -84,11 +84,11 @@ def _timed(rule: Callable[[], list[str]]) -> Answer:
 # ------------------------------------------------------------------------------ equation of motion
 def regression_of(screened: Any) -> Regression:
     """:param screened: a `sb3_hds.sysid.equation.screening.Screened`"""
-    from sb3_hds.sysid.equation.assembly import equation
+    from sb3_hds.sysid.equation.assembly import assemble
     from sb3_hds.sysid.equation.terms import terms
 
     motion, twin = screened.motion, screened.hypotheses.believed
-    made = equation(screened.hypotheses, motion)
+    made = assemble(screened.hypotheses, motion)
     q, v, change, actions = (
         np.concatenate(parts)
         for parts in zip(
@@ -230,7 +230,7 @@ def by_simulation(twin: Any, data: Any, seed: int) -> list[str]:
         inquiry = Inquiry(twin, data, kinds, (), seed, "full", False)
     if inquiry.given.convention is not None or inquiry.given.poor:
         return []
-    inquiry.prepare()
+    inquiry.split_halves()
     search, h = inquiry.search, inquiry.hypotheses
     own = [c for c in h.candidates if not c.key.endswith(".all")]
     free = sorted({i for c in own for i in h.indices(c)})

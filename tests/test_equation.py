@@ -12,7 +12,7 @@ from sb3_hds import Trajectories, diagnose, effects, twins
 from sb3_hds.core import rollout
 from sb3_hds.sysid.checks.conventions import other_convention
 from sb3_hds.sysid.checks.timing import match_logged_integrator
-from sb3_hds.sysid.equation.assembly import equation
+from sb3_hds.sysid.equation.assembly import assemble
 from sb3_hds.sysid.equation.effect_columns import impulse_weights
 from sb3_hds.sysid.equation.screening import screen
 from sb3_hds.sysid.equation.terms import effective_inertia, terms
@@ -20,14 +20,14 @@ from sb3_hds.sysid.equation.weak_form import weak_rows
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.measurements import white_noise
 from sb3_hds.sysid.motion.joints import differences, kinematics
-from sb3_hds.sysid.motion.motion import motion
+from sb3_hds.sysid.motion.motion import smoothed_motion
 from sb3_hds.sysid.motion.smoothing import smooth
 
 
 def proposed(twin, data, calibrate=()):
     """Sizes of the causes that are proposed, by key and short name."""
     twin, data, _ = match_logged_integrator(twin, data)
-    found = screen(twin, motion(twin, data), effects.ALL, calibrate)
+    found = screen(twin, smoothed_motion(twin, data), effects.ALL, calibrate)
     return {m.key: m.sizes for m in found.members}
 
 
@@ -98,13 +98,13 @@ def test_the_same_data_in_other_units_give_the_same_causes(as_it_is, units):
 
 def screened(**changes):
     twin, data = rubbing_axis(**changes)
-    return screen(twin, motion(twin, data), effects.ALL, ())
+    return screen(twin, smoothed_motion(twin, data), effects.ALL, ())
 
 
 def test_friction_against_velocity_is_what_rubs_with_other_causes_taken_off():
     """Viscous 3 N s/m and dry 1.5 N, beside an offset of 2 N, in which no friction is."""
     twin, data = rubbing_axis(pull=lambda q, v: 2.0 - 3.0 * v)
-    found = screen(twin, motion(twin, data), effects.ALL, ())
+    found = screen(twin, smoothed_motion(twin, data), effects.ALL, ())
     (curve,) = found.friction_curves([m.key for m in found.members])
 
     assert curve.joint == 0 and np.all(np.diff(curve.velocity) > 0.0)
@@ -122,7 +122,7 @@ def test_bumps_are_wide_where_velocities_are_noisy_and_narrow_where_something_el
         pull = lambda q, v: -3.0 * v + unknown * np.sin(6.0 * q)  # noqa: E731
         twin, data = rubbing_axis(noise=noise, pull=pull)
         known = Hypotheses.about(twin, (effects.ViscousFriction, effects.CoulombFriction), ())
-        rows = weak_rows(equation(known, motion(twin, data)), 0)
+        rows = weak_rows(assemble(known, smoothed_motion(twin, data)), 0)
         return rows.narrowed
 
     assert narrowed(unknown=0.0, noise=1.0) == 1.0
@@ -220,7 +220,7 @@ def test_a_gain_multiplies_commands_that_are_late(lag):
         effects.ViscousFriction(b=4.0).at(0),
     )
     data = measured(real, n=4, noise=1e-4, commands=waves(0.01))
-    found = screen(twin, motion(twin, data), effects.ALL, ())
+    found = screen(twin, smoothed_motion(twin, data), effects.ALL, ())
 
     sizes = found.sizes_of(["viscous_friction.axis", "torque_gain.force", "motor_lag.force"])
     assert sizes == {
@@ -288,7 +288,7 @@ def test_a_spring_that_hardens_is_one_whatever_the_clock(slower):
 )
 def test_other_conventions_of_a_log_are_reported_before_any_cause(given, name):
     twin, data = given()
-    found = other_convention(twin, motion(twin, data), ())
+    found = other_convention(twin, smoothed_motion(twin, data), ())
 
     assert (found and found.key.partition(".")[0]) == name
 

@@ -23,7 +23,7 @@ from sb3_hds import effects
 from sb3_hds.sysid.checks.timing import match_logged_integrator
 from sb3_hds.sysid.equation.screening import screen
 from sb3_hds.sysid.equation.selection import _one_for_two
-from sb3_hds.sysid.motion.motion import motion
+from sb3_hds.sysid.motion.motion import smoothed_motion
 
 VISCOUS, DRY = "viscous_friction.axis", "coulomb_friction.axis"
 
@@ -118,7 +118,7 @@ def test_sets_are_judged_cause_by_cause_and_name_by_name(said, named, right, fla
 @pytest.fixture(scope="module")
 def screened():
     twin, data, _ = match_logged_integrator(*first_users.joint_with_friction())
-    return screen(twin, motion(twin, data), effects.ALL, ())
+    return screen(twin, smoothed_motion(twin, data), effects.ALL, ())
 
 
 def test_what_is_there_shows_and_what_is_not_does_not(screened):
@@ -152,7 +152,7 @@ def test_one_mass_takes_the_place_of_a_moment_and_an_inertia():
     twin = nominal_twin("pendulum")
     real = twin.with_parameters(mass=0.8 * twin.values["mass"])
     data = measured(real, n=4, noise=1e-4, commands=jumping(4, n_levels=30, size=0.3))
-    p = screen(twin, motion(twin, data), effects.ALL, ()).problem
+    p = screen(twin, smoothed_motion(twin, data), effects.ALL, ()).problem
     named = {item.key: i for i, item in enumerate(p.items)}
     both = [named["parameter.com"], named["parameter.inertia"]]
 

@@ -21,7 +21,7 @@ from sb3_hds import Trajectories, diagnose, effects, twins
 from sb3_hds.core import Channel, Joint
 from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
 from sb3_hds.sysid.equation.screening import screen
-from sb3_hds.sysid.motion.motion import motion
+from sb3_hds.sysid.motion.motion import smoothed_motion
 from sb3_hds.twins.rigs.linear_axis import LinearAxis
 
 # Of a size, by how much it may differ: what is not linear in a fit may end a little elsewhere. Of
@@ -275,7 +275,7 @@ PAIRS = {
 # ------------------------------------------------------------------------------ what is said
 def proposed(log: Log) -> dict[str, tuple[str, float]]:
     """:return: of each cause that the equation of motion proposes: unit and size"""
-    found = screen(log.twin, motion(log.twin, log.data), effects.ALL, ())
+    found = screen(log.twin, smoothed_motion(log.twin, log.data), effects.ALL, ())
     return {
         (m.key, name): (_unit(found.hypotheses, m.key, name), value)
         for m in found.members

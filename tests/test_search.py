@@ -20,7 +20,7 @@ KINDS = (effects.ViscousFriction, effects.CoulombFriction, effects.StribeckFrict
 @pytest.fixture(scope="module")
 def searched():
     inquiry = Inquiry(TWIN, on_engine(n=4, friction=0.1), KINDS, (), 0, "quick", False)
-    inquiry.prepare()
+    inquiry.split_halves()
     inquiry.settle_noise()
     return inquiry.search
 

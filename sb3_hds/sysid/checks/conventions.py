@@ -13,7 +13,7 @@ import numpy as np
 from sb3_hds.core import AnalyticTwin, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ConstantForce, CoulombFriction, ViscousFriction
-from sb3_hds.sysid.equation.assembly import equation, problem
+from sb3_hds.sysid.equation.assembly import assemble, normal_problem
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.motion.motion import JointMotion, Motion
 
@@ -132,8 +132,8 @@ def _keys(twin: Twin) -> set[str]:
 
 def _residual(hypotheses: Hypotheses, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """:return: independent rows of each joint, and its residual in units of the noise"""
-    made = equation(hypotheses, motion, quick=True)
-    p = problem(hypotheses, made)
+    made = assemble(hypotheses, motion, quick=True)
+    p = normal_problem(hypotheses, made)
     keys = list(range(len(p.items)))
     found = p.solve(keys)
     rss = p.by_joint(found.weights, p.grams.by_joint)

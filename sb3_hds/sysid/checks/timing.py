@@ -21,7 +21,7 @@ from sb3_hds.data.audit.results import shifted
 from sb3_hds.data.audit.velocity import VelocityPair, best_pairs, velocity_pairs
 from sb3_hds.sysid.checks.conventions import residual_beside_friction
 from sb3_hds.sysid.motion.joints import encoders, joint_motion, kinematics, velocity_time_of
-from sb3_hds.sysid.motion.motion import motion
+from sb3_hds.sysid.motion.motion import smoothed_motion
 
 # Longest shift that is attributed to computation [samples], [s], and the least that counts.
 _SAMPLES, _SECONDS, _VISIBLE = 1.0, 2e-3, 0.1
@@ -118,7 +118,7 @@ def match_logged_integrator(
     channels = [e.velocity for e in encoders(twin).values() if e.velocity is not None]
     if not channels:
         return twin, data, ()
-    before = motion(twin, data)
+    before = smoothed_motion(twin, data)
     if not before.moves.any() or not before.measured.any():
         return twin, data, ()
     found = kinematics(joint_motion(twin, data), data.dt, before.period)
@@ -147,7 +147,7 @@ def stepping_by(twin: Twin, integrator: Integrator) -> Twin:
 
 
 def _log_residual(twin: Twin, data: Trajectories) -> float:
-    weight, left = residual_beside_friction(twin, motion(twin, data))
+    weight, left = residual_beside_friction(twin, smoothed_motion(twin, data))
     return float(weight @ np.log(left))
 
 

@@ -85,7 +85,7 @@ class Inquiry:
         self.hypotheses, self.screened = self.given.hypotheses, self.given.screened
         self.effort = EFFORTS[budget]
 
-    def prepare(self) -> None:
+    def split_halves(self) -> None:
         """Set up both halves of the data, and typical sizes of the parameters on this machine."""
         select, confirm = self.given.halves()
         self.hypotheses = select.evidence.hypotheses
@@ -97,7 +97,7 @@ class Inquiry:
     def run(self) -> Diagnosis:
         if self.given.convention is not None:
             return self.wrong_convention(self.given.convention)
-        self.prepare()
+        self.split_halves()
         if self.screened and len(self.screened.members) > 1:
             several = self._several(self.screened)
             if several is not None:

@@ -26,7 +26,7 @@ from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.parameters import Belief
 from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
 from sb3_hds.sysid.measurements import channel_deviations, white_noise
-from sb3_hds.sysid.motion.motion import Motion, motion
+from sb3_hds.sysid.motion.motion import Motion, smoothed_motion
 from sb3_hds.sysid.progress import Bar
 
 # Length of a window in periods of the motion, within these numbers of steps; it is half as long
@@ -201,7 +201,7 @@ def prepare(
     data, in_time = align_velocities(twin, data)
     sensor_noise = white_noise([data.episode(i)[0] for i in range(len(data))])
     twin, data, as_logged = match_logged_integrator(twin, data)
-    moved = motion(twin, data)
+    moved = smoothed_motion(twin, data)
     period = moved.typical_period
     coarse, data, every = thinned(twin, data, moved.fastest)
     convention, screened, least_substeps = None, None, coarse.substeps
@@ -281,7 +281,7 @@ def shortened_to(twin: Twin, data: Trajectories) -> tuple[Trajectories, tuple[st
     if data.n_steps <= most:
         return data, ()
     sample = _stretches(data, _LOOK, _LOOK * _FEWEST_STRETCHES)
-    moved = motion(twin, sample)
+    moved = smoothed_motion(twin, sample)
     most *= max(1, int(moved.fastest / (_SAMPLES * data.dt)))
     if data.n_steps <= most:
         return data, ()

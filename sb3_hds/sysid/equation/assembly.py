@@ -37,7 +37,7 @@ _BEYOND = 0.5
 _QUIETEST = 1e-6
 
 
-def equation(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equation:
+def assemble(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equation:
     """
     :param hypotheses: candidates, and the nominal model, at the interval of the motion
     :param motion: of the joints
@@ -146,7 +146,7 @@ def _add_parameter(made: Equation, candidate: Candidate) -> None:
         made.drives[candidate.key] = drive
 
 
-def problem(hypotheses: Hypotheses, equation: Equation) -> Problem:
+def normal_problem(hypotheses: Hypotheses, equation: Equation) -> Problem:
     """:return: its normal equations, with bounds, prices and prior odds of all items"""
     items, n = tuple(equation.items), len(equation.columns)
     lower, upper, prior = np.full(n, -np.inf), np.full(n, np.inf), np.zeros(n + 1)

@@ -7,7 +7,7 @@ import numpy as np
 
 from sb3_hds.core import AnalyticTwin, Effect, Twin
 from sb3_hds.core.twin import plant_of
-from sb3_hds.sysid.equation.assembly import equation, problem, refuted_by_kinematics
+from sb3_hds.sysid.equation.assembly import assemble, normal_problem, refuted_by_kinematics
 from sb3_hds.sysid.equation.held_out_folds import enforce_bounds, predictable, retune, simpler_items
 from sb3_hds.sysid.equation.members import (
     ByVelocity,
@@ -213,10 +213,10 @@ def screen(
     hypotheses = Hypotheses.about(
         coarse, effects, calibrate, period=moved.typical_period, speeds=tuple(moved.speed)
     )
-    made = equation(hypotheses, moved)
+    made = assemble(hypotheses, moved)
     if not made.items:
         return None
-    p = problem(hypotheses, made)
+    p = normal_problem(hypotheses, made)
     chosen, hinted = propose(p)
     set_of = _members_of(hypotheses, p, [i for i in chosen if i not in p.always])
     hints = tuple(p.items[i].key for i in hinted)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from sb3_hds.core import AnalyticTwin, State, Trajectories, Twin
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.sysid.estimation.parameters import one_each
-from sb3_hds.sysid.motion.motion import motion
+from sb3_hds.sysid.motion.motion import smoothed_motion
 
 # Gauss-Newton steps: most parameters are linear, and need one; Huber's weights need a few.
 _STEPS = 6
@@ -75,7 +75,7 @@ def by_inverse_dynamics(
     """
     if not isinstance(twin, AnalyticTwin):
         return None
-    moved = motion(twin, data)
+    moved = smoothed_motion(twin, data)
     middle = lambda x: 0.5 * (x[1:] + x[:-1])  # noqa: E731
     parts = [(middle(r.q), middle(r.v), middle(r.a), r.actions) for r in moved.recordings]
     recording = np.repeat(moved.origin, [len(r.actions) for r in moved.recordings])

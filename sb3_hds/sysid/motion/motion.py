@@ -115,7 +115,7 @@ class Motion(NamedTuple):
         return self.excursion > _STILL * self.noise_q
 
 
-def motion(twin: Twin, data: Trajectories) -> Motion:
+def smoothed_motion(twin: Twin, data: Trajectories) -> Motion:
     """
     :param twin: reads positions and velocities from observations
     :param data: measured, sampled at the twin's ``dt``
