@@ -272,7 +272,7 @@ def run(
         case, data, motion = draw(system, number, kind=kind, noise=noise, most=most)
     twin, started = nominal_twin(system, case.seen), time.time()
     inquiry = Inquiry(twin, data, effects.ALL, case.nuisances, number, budget, False)
-    reason = inquiry.given.poor
+    reason = inquiry.given.reason_to_refuse
     found = inquiry.refused(reason) if reason else inquiry.run()
     seconds = time.time() - started
     names = [key(finding) for finding in found.findings]

@@ -228,7 +228,7 @@ def by_simulation(twin: Any, data: Any, seed: int) -> list[str]:
     )
     with _without_screening():
         inquiry = Inquiry(twin, data, kinds, (), seed, "full", False)
-    if inquiry.given.convention is not None or inquiry.given.poor:
+    if inquiry.given.convention is not None or inquiry.given.reason_to_refuse:
         return []
     inquiry.split_halves()
     search, h = inquiry.search, inquiry.hypotheses
@@ -237,8 +237,8 @@ def by_simulation(twin: Any, data: Any, seed: int) -> list[str]:
     fitted = search.base(h.null, free)
     # What the fit leaves is the noise of each channel.
     search = search.with_noise(np.sqrt(np.mean(fitted.point.residual**2, (0, 1))) + 1e-300)
-    every, point = search.pooled(search.refit(fitted))
-    stderr = standard_errors(every, point, free)
+    whole, point = search.pooled(search.refit(fitted))
+    stderr = standard_errors(whole, point, free)
     wide = stats.norm.ppf(0.5 + _CONFIDENCE / 2.0) * stderr
     moved = np.abs(point.theta - h.null) > wide
     sizes = {c.key: [i for i in h.indices(c) if not h.names[i].endswith(".q0")] for c in own}
@@ -252,7 +252,9 @@ def one_by_one(twin: Any, data: Any, seed: int, budget: str) -> list[str]:
 
     with _without_screening():
         inquiry = Inquiry(twin, data, effects.ALL, (), seed, budget, False)
-    return [] if inquiry.given.poor else [finding.key for finding in inquiry.run().findings]
+    if inquiry.given.reason_to_refuse:
+        return []
+    return [finding.key for finding in inquiry.run().findings]
 
 
 @contextmanager

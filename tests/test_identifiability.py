@@ -78,7 +78,7 @@ class Curve:
 
 def interval(cost, **bounds):
     best = Point(np.zeros(2), np.zeros((1, 1)), np.zeros((1, 1, 1)), cost(0.0))
-    return profiled(Curve(cost, **bounds), best, [0, 1], 0, half=0.3)
+    return profiled(Curve(cost, **bounds), best, [0, 1], 0, reach=0.3)
 
 
 def test_the_interval_of_a_parabola_is_symmetric():

@@ -62,7 +62,7 @@ def test_a_search_cannot_be_changed(searched):
 def test_intervals_of_several_causes_are_no_narrower_than_models_are_exact(searched, of_equation):
     start = searched.base(searched.hypotheses.null, ())
     best = searched.finalists(start, [])[0]
-    every, point = searched.pooled(searched.believing(best, start))
+    whole, point = searched.pooled(searched.believing(best, start))
     free = searched.hypotheses.indices(best.candidate)
     exact = {name: (2.0, 2.0, 2.0) for name in best.candidate.parameters}
     verdict = searched.ranking.compare(best.held_out, start.held_out)
@@ -72,7 +72,7 @@ def test_intervals_of_several_causes_are_no_narrower_than_models_are_exact(searc
         exact = {n: (point.theta[i],) * 3 for n, i in zip(exact, free, strict=True)}
         among = among._replace(sizes=exact)
 
-    plain, wide = (finding(one, every, point, free, False).parameters for one in (alone, among))
+    plain, wide = (finding(one, whole, point, free, False).parameters for one in (alone, among))
 
     for name, one in wide.items():
         reach = plain[name].high - plain[name].estimate

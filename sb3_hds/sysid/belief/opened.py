@@ -40,7 +40,7 @@ def open_answers(
     base: Base,
     extended: Extended,
     data: Trajectories,
-    every: int,
+    thinning: int,
     unexplained: str = "",
 ) -> Answers:
     """
@@ -53,7 +53,7 @@ def open_answers(
     :param base: fit of the causes
     :param extended: makes the twin of an answer
     :param data: of the same interval as the windows
-    :param every: steps of the twin in one of the windows
+    :param thinning: steps of the twin in one of the windows
     :param unexplained: what remains, in words; empty if nothing does
     """
     h = search.hypotheses
@@ -86,8 +86,8 @@ def open_answers(
     return Answers(
         tuple(_answer(search, weight, causes, one, extended) for weight, causes, one in answers),
         np.asarray(search.noise, float),
-        every * max(base.held_out.residual.size / n_effective, 1.0),
-        every * (base.held_out.residual.shape[1] - 1),
+        thinning * max(base.held_out.residual.size / n_effective, 1.0),
+        thinning * (base.held_out.residual.shape[1] - 1),
         _slowest(h.believed, data),
     )
 
@@ -109,11 +109,11 @@ def _answer(
     extended: Extended,
 ) -> Answer:
     h, keys = search.hypotheses, tuple(c.key for c in candidates)
-    every, point = search.pooled(base)
+    whole, point = search.pooled(base)
     twin = extended(keys, point.theta)
     if not base.free:
         return Answer(keys, twin, {}, float(log_weight))
-    covariance = joint_covariance(every, point, base.free)
+    covariance = joint_covariance(whole, point, base.free)
     # Typical deviations: the declared one, the smallest that these data show, or what was found.
     declared = np.array([h.parameter(name).scale for name in h.names])
     typical = np.maximum(np.maximum(declared, h.scale), np.abs(point.theta - h.null))

@@ -146,12 +146,12 @@ def aliased_with(
 
 
 def profiled(
-    evidence: Evidence, point: Point, free: Sequence[int], index: int, half: float
+    evidence: Evidence, point: Point, free: Sequence[int], index: int, reach: float
 ) -> tuple[float, float]:
     """
     The interval of a parameter by its profile likelihood: where the cost, all other free parameters
     and the start states refitted, has risen by what the parabola at the best fit rises over
-    ``half``. So it is as wide as a standard error that allows for correlated errors wants it, but
+    ``reach``. So it is as wide as a standard error that allows for correlated errors wants it, but
     need not be symmetric: a dead zone or a delay may be known on one side only.
 
     Source: Raue et al., Bioinformatics 25, 2009 (profile likelihood); the rise is scaled as the
@@ -160,7 +160,7 @@ def profiled(
     :param point: the best fit
     :param free: indices of what was fitted
     :param index: of the parameter, one of ``free``
-    :param half: half the width of the symmetric interval
+    :param reach: half the width of the symmetric interval
     :return: both ends; a physical bound where the cost does not rise enough before it
     """
     h = evidence.hypotheses
@@ -168,15 +168,15 @@ def profiled(
     curvature = evidence.slopes(point, [index, *others]).curvature.sum(0)
     inner = np.linalg.pinv(curvature[1:, 1:], rcond=_RANK, hermitian=True)
     along = curvature[0, 0] - curvature[0, 1:] @ inner @ curvature[1:, 0]
-    rise = 0.5 * max(along, 0.0) * (half / h.scale[index]) ** 2
+    rise = 0.5 * max(along, 0.0) * (reach / h.scale[index]) ** 2
     best = point.theta[index]
-    if not np.isfinite(half) or not 0.0 < rise < np.inf:
+    if not np.isfinite(reach) or not 0.0 < rise < np.inf:
         return float(h.lower[index]), float(h.upper[index])
     follow = -inner @ curvature[1:, 0] * h.scale[others] / h.scale[index]
 
     def end(side: float) -> float:
         bound = float(h.lower[index] if side < 0.0 else h.upper[index])
-        away, offsets = half, point.offsets
+        away, offsets = reach, point.offsets
         for _ in range(_MOST_TRIES):
             value = float(np.clip(best + side * away, h.lower[index], h.upper[index]))
             theta = point.theta.copy()

@@ -158,9 +158,9 @@ class Search(NamedTuple):
         shots = (half.evidence.shots for half in pair)
         shots = Shots(*map(np.concatenate, zip(*shots, strict=True)))
         cluster = np.concatenate([half.cluster for half in pair])
-        every = Half(self.select.evidence.on(shots), cluster, self.select.irrelevant)
+        whole = Half(self.select.evidence.on(shots), cluster, self.select.irrelevant)
         offsets = np.concatenate([base.point.offsets, base.held_out.offsets])
-        return every, every.evidence.fit(base.point.theta, base.free, offsets)
+        return whole, whole.evidence.fit(base.point.theta, base.free, offsets)
 
     def fit_roughly(self, base: Base, accepted: Sequence[str]) -> list[Rough]:
         """

@@ -76,7 +76,7 @@ def diagnose(
     kinds, nuisances = classes_of(effects), _beliefs_of(calibrate)
     with Bar(progress) as bar:
         inquiry = Inquiry(twin, data, kinds, nuisances, int(seed), budget, bar)
-        reason = inquiry.given.poor
+        reason = inquiry.given.reason_to_refuse
         return inquiry.refused(reason) if reason else inquiry.run()
 
 

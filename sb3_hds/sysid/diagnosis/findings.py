@@ -274,9 +274,9 @@ def contradiction(weighed: Sequence[tuple[Candidate, Comparison]]) -> str:
     )
 
 
-def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int, HorizonGain]:
+def by_horizon(half: Half, before: Point, after: Point, thinning: int) -> dict[int, HorizonGain]:
     """
-    :param every: steps of the data in one of the windows
+    :param thinning: steps of the data in one of the windows
     :return: errors some steps ahead, by the number of steps of the data
     """
     found, last = {}, before.residual.shape[1] - 1
@@ -287,5 +287,6 @@ def by_horizon(half: Half, before: Point, after: Point, every: int) -> dict[int,
         )
         gained = t_test(new, old, half.cluster)
         rms = [float(np.sqrt(np.mean(errors))) for errors in (old, new)]
-        found[ahead * every] = HorizonGain(ahead * every, rms[0], rms[1], gained.low, gained.high)
+        steps = ahead * thinning
+        found[steps] = HorizonGain(steps, rms[0], rms[1], gained.low, gained.high)
     return found

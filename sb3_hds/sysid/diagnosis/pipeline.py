@@ -331,14 +331,14 @@ class Inquiry:
     ) -> Diagnosis:
         self.bar.stage("sizes and intervals")
         select, confirm = self.search.select, self.search.confirm
-        every, point = self.search.pooled(base)
+        whole, point = self.search.pooled(base)
         findings = tuple(
-            finding(one, every, point, base.free, self.effort.profiles)
+            finding(one, whole, point, base.free, self.effort.profiles)
             for one in self._beside_the_equation(found)
         )
         remains = "" if left.remainder is None else in_words(left.remainder)
         unexplained = " ".join(filter(None, (nearest, remains)))
-        gain = by_horizon(confirm, start.held_out, base.held_out, self.given.every)
+        gain = by_horizon(confirm, start.held_out, base.held_out, self.given.thinning)
         return Diagnosis(
             verdict=verdict_of(findings, unexplained),
             believed=self.believed,
@@ -371,7 +371,7 @@ class Inquiry:
                 confirm,
                 start.held_out,
                 base.held_out,
-                self.given.every,
+                self.given.thinning,
                 before.missing,
                 left.missing,
                 self.screened.friction_curves(keys_of(found)) if self.screened else (),
@@ -384,7 +384,7 @@ class Inquiry:
                 base,
                 self._extended,
                 self.given.data,
-                self.given.every,
+                self.given.thinning,
                 unexplained,
             ),
         )

@@ -105,7 +105,7 @@ class Prepared:
     :param corrected: what was corrected in them, a sentence each
     :param sensor_noise: standard deviation of each channel's noise, shape ``(n_obs,)``
     :param data: recordings, at the interval that a diagnosis needs
-    :param every: samples of the log in one of these
+    :param thinning: samples of the log in one of these
     :param period: typical period of the motion [s]
     :param convention: of the model that the log does not follow; None if it follows all
     :param screened: causes by the equation of motion; None where there is no such equation
@@ -122,7 +122,7 @@ class Prepared:
     corrected: tuple[str, ...]
     sensor_noise: Float[np.ndarray, " obs"]
     data: Trajectories
-    every: int
+    thinning: int
     period: float
     convention: Convention | None
     screened: Screened | None
@@ -135,7 +135,7 @@ class Prepared:
     least_substeps: int
 
     @property
-    def poor(self) -> str:
+    def reason_to_refuse(self) -> str:
         """Why these data cannot support a verdict; empty if they may."""
         if self.audit.reason:
             return self.audit.reason
@@ -203,7 +203,7 @@ def prepare(
     twin, data, as_logged = match_logged_integrator(twin, data)
     moved = smoothed_motion(twin, data)
     period = moved.typical_period
-    coarse, data, every = thinned(twin, data, moved.fastest)
+    coarse, data, thinning = thinned(twin, data, moved.fastest)
     convention, screened, least_substeps = None, None, coarse.substeps
     if not audited.reason:
         bar.stage("trying conventions")
@@ -229,7 +229,7 @@ def prepare(
         corrected=(*corrected, *shortened, *in_time, *as_logged),
         sensor_noise=sensor_noise,
         data=data,
-        every=every,
+        thinning=thinning,
         period=period,
         convention=convention,
         screened=screened,
@@ -301,22 +301,22 @@ def _stretches(data: Trajectories, length: int, most: int) -> Trajectories:
     """
     shortest, longest = int(data.lengths.min()), int(data.lengths.max())
     length = min(length, shortest if 10 * shortest > length else longest)
-    every = data.windows(length)
-    parts = np.array_split(np.arange(len(every)), min(max(most // length, 1), len(every)))
+    windows = data.windows(length)
+    parts = np.array_split(np.arange(len(windows)), min(max(most // length, 1), len(windows)))
     rng = np.random.default_rng(0)
-    return every[[int(rng.choice(part)) for part in parts]]
+    return windows[[int(rng.choice(part)) for part in parts]]
 
 
 class Thinned(NamedTuple):
     """
     :param twin: with the longer interval
     :param data: every n-th observation, and the mean of the commands in between
-    :param every: 1 where nothing was changed
+    :param thinning: 1 where nothing was changed
     """
 
     twin: Twin
     data: Trajectories
-    every: int
+    thinning: int
 
 
 def thinned(twin: Twin, data: Trajectories, period: float) -> Thinned:
@@ -330,17 +330,17 @@ def thinned(twin: Twin, data: Trajectories, period: float) -> Thinned:
     :param data: sampled at the twin's ``dt``
     :param period: of the fastest motion in them [s]
     """
-    every = min(round(period / _SAMPLES / data.dt), int(data.lengths.min()))
-    if every <= 1:
+    thinning = min(round(period / _SAMPLES / data.dt), int(data.lengths.min()))
+    if thinning <= 1:
         return Thinned(twin, data, 1)
-    dt, inner = every * data.dt, twin.dt / twin.substeps
+    dt, inner = thinning * data.dt, twin.dt / twin.substeps
     if getattr(plant_of(twin), "integrator", None) is rk4:
         inner = max(inner, period / _SUBSTEPS)
-    pieces = [_every(*data.episode(i), every) for i in range(len(data))]
+    pieces = [_every_nth(*data.episode(i), thinning) for i in range(len(data))]
     obs, actions = (list(leaves) for leaves in zip(*pieces, strict=True))
     coarse = Trajectories.from_arrays(obs, actions, dt=dt, conditions=data.conditions)
     coarse = dataclasses.replace(coarse, origin=data.origin, report=data.report)
-    return Thinned(twin.at_interval(dt, math.ceil(dt / inner - 1e-9)), coarse, every)
+    return Thinned(twin.at_interval(dt, math.ceil(dt / inner - 1e-9)), coarse, thinning)
 
 
 def fine_enough(twin: Twin, screened: Screened) -> Twin:
@@ -355,10 +355,12 @@ def fine_enough(twin: Twin, screened: Screened) -> Twin:
     return twin.at_interval(twin.dt, max(wanted, twin.substeps))
 
 
-def _every(obs: np.ndarray, actions: np.ndarray, every: int) -> tuple[np.ndarray, np.ndarray]:
-    n = len(actions) // every
-    means = actions[: n * every].reshape(n, every, actions.shape[1]).mean(1)
-    return obs[: n * every + 1 : every], means
+def _every_nth(
+    obs: np.ndarray, actions: np.ndarray, thinning: int
+) -> tuple[np.ndarray, np.ndarray]:
+    n = len(actions) // thinning
+    means = actions[: n * thinning].reshape(n, thinning, actions.shape[1]).mean(1)
+    return obs[: n * thinning + 1 : thinning], means
 
 
 def _span(twin: Twin, moved: Motion, period: float) -> float:

@@ -255,7 +255,9 @@ class Evidence:
         h = self.hypotheses
         active = theta != h.null
         # An effect at its null needs no memory, but its slope may need the last few commands.
-        begins = np.where(active, h.forgets, np.minimum(h.forgets, Effect.forgets * h.period))
+        begins = np.where(
+            active, h.memory_length, np.minimum(h.memory_length, Effect.forgets * h.period)
+        )
         active[index] = True
         longest = max(h.always, float(begins[active].max(initial=0.0)))
         return min(n_steps_of(longest, h.twin.dt), self._most_known)

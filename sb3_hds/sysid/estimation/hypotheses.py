@@ -210,7 +210,7 @@ class Hypotheses:
             return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), self.twin.params)
 
     @cached_property
-    def forgets(self) -> Float[np.ndarray, " p"]:
+    def memory_length(self) -> Float[np.ndarray, " p"]:
         """:return: after how long the memory that each parameter shapes is forgotten [s]"""
         found = {
             f"{a.key}.{name}": remembers_for(a.effect, self.period)

@@ -32,18 +32,18 @@ class Forces(NamedTuple):
         rule, shape ``(n, dof)``
     :param slopes: of these by the parameters, shape ``(n, dof, p)``
     :param recording: that each row is from, shape ``(n,)``
-    :param every: samples of the data between two rows
+    :param thinning: samples of the data between two rows
     """
 
     values: np.ndarray
     errors: np.ndarray
     slopes: np.ndarray
     recording: np.ndarray
-    every: int
+    thinning: int
 
     def windows(self, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """:return: errors, slopes and recording of windows of this many samples"""
-        rows = max(1, steps // self.every)
+        rows = max(1, steps // self.thinning)
         places = []
         for one in np.unique(self.recording):
             own = np.flatnonzero(self.recording == one)
@@ -101,7 +101,7 @@ def by_inverse_dynamics(
             right = np.concatenate([-errors.ravel(), (own - values) / scale / _BELIEF])
             room = (lower - values) / scale, (upper - values) / scale
             values = np.clip(values + scale * _within(whole, right, room), lower, upper)
-    return Forces(values, errors, table, recording, moved.every)
+    return Forces(values, errors, table, recording, moved.thinning)
 
 
 def _weights(missing: np.ndarray, threshold: float) -> np.ndarray:

@@ -52,7 +52,7 @@ class Motion(NamedTuple):
     :param recordings: in order
     :param origin: recording that each trajectory is from, shape ``(n,)``
     :param dt: interval of the rows [s]
-    :param every: samples of the data in one interval
+    :param thinning: samples of the data in one interval
     :param measured: whether a joint's velocity is measured, shape ``(dof,)``
     :param noise_q: of each joint's position sensor
     :param noise_v: of each joint's velocity sensor, or of the differences that stand for it
@@ -67,7 +67,7 @@ class Motion(NamedTuple):
     recordings: tuple[JointMotion, ...]
     origin: np.ndarray
     dt: float
-    every: int
+    thinning: int
     measured: np.ndarray
     noise_q: np.ndarray
     noise_v: np.ndarray
@@ -86,8 +86,7 @@ class Motion(NamedTuple):
     @property
     def excursion(self) -> Float[np.ndarray, " dof"]:
         """Range of each joint's positions over all recordings."""
-        every = np.concatenate([r.q for r in self.recordings])
-        return np.ptp(every, axis=0)
+        return np.ptp(np.concatenate([r.q for r in self.recordings]), axis=0)
 
     @property
     def fastest(self) -> float:
@@ -103,7 +102,9 @@ class Motion(NamedTuple):
 
     def twin(self, twin: Twin) -> Twin:
         """:return: a twin of the data's interval, at that of the rows"""
-        return twin.at_interval(self.dt, twin.substeps * self.every) if self.every > 1 else twin
+        return (
+            twin.at_interval(self.dt, twin.substeps * self.thinning) if self.thinning > 1 else twin
+        )
 
     @property
     def _length(self) -> float:
@@ -135,32 +136,32 @@ def smoothed_motion(twin: Twin, data: Trajectories) -> Motion:
     ]
     mean = lambda name: np.median([[getattr(c, name) for c in cs] for cs in found], axis=0)  # noqa: E731
     period = 2.0 * np.pi * _rms([v[1] for v in values]) / (_rms([v[2] for v in values]) + 1e-300)
-    every = max(
+    thinning = max(
         1, int(np.min(period[np.isfinite(period)], initial=np.inf) / (_PER_PERIOD * data.dt))
     )
-    every = min(every, max(1, int(data.lengths.min()) // _PER_PERIOD))
-    every = min(every, -(-int(data.lengths.sum()) // _ENOUGH))
+    thinning = min(thinning, max(1, int(data.lengths.min()) // _PER_PERIOD))
+    thinning = min(thinning, -(-int(data.lengths.sum()) // _ENOUGH))
     recordings = []
     for (q, v, commands), smoothed, known in zip(logged, values, expected, strict=True):
         measured_v = v.copy()
         still = ~measured
         if still.any():
             measured_v[:, still] = _differences(q, data.dt, velocity_time, known)[:, still]
-        recordings.append(_thinned(smoothed, measured_v, commands, every))
+        recordings.append(_thinned(smoothed, measured_v, commands, thinning))
     noise_q, noise_v = mean("noise_q"), mean("noise_v")
     noise_v = np.where(measured, noise_v, np.sqrt(0.5 + 6.0 * velocity_time**2) * noise_q / data.dt)
     return Motion(
         tuple(recordings),
         np.asarray(data.origin),
-        every * data.dt,
-        every,
+        thinning * data.dt,
+        thinning,
         measured,
         noise_q,
-        noise_v / np.sqrt(every),
+        noise_v / np.sqrt(thinning),
         mean("error_v"),
         period,
-        np.maximum(np.ceil(0.5 * mean("half") / every), 2.0).astype(int),
-        1.0 if velocity_time == 0.0 else 1.0 - 1.0 / (twin.substeps * every),
+        np.maximum(np.ceil(0.5 * mean("half") / thinning), 2.0).astype(int),
+        1.0 if velocity_time == 0.0 else 1.0 - 1.0 / (twin.substeps * thinning),
         np.array([2.0 * np.pi if joint.unit == "rad" else np.inf for joint in twin.joints]),
         measured & kinematics([(q, v) for q, v, _ in logged], data.dt, period).agrees,
     )
@@ -239,16 +240,16 @@ def _differences(
 
 
 def _thinned(
-    smoothed: tuple[np.ndarray, ...], measured_v: np.ndarray, actions: np.ndarray, every: int
+    smoothed: tuple[np.ndarray, ...], measured_v: np.ndarray, actions: np.ndarray, thinning: int
 ) -> JointMotion:
     q, v, a = smoothed
-    if every == 1:
+    if thinning == 1:
         return JointMotion(q, v, a, measured_v, actions)
-    n = len(actions) // every
-    rows = slice(0, n * every + 1, every)
-    held = actions[: n * every].reshape(n, every, actions.shape[1]).mean(1)
+    n = len(actions) // thinning
+    rows = slice(0, n * thinning + 1, thinning)
+    held = actions[: n * thinning].reshape(n, thinning, actions.shape[1]).mean(1)
     # A cubic through its neighbours: noise is averaged, motion is not.
-    averaged = np.stack([smooth_mean(x, every) for x in measured_v.T], 1)
+    averaged = np.stack([smooth_mean(x, thinning) for x in measured_v.T], 1)
     return JointMotion(q[rows], v[rows], a[rows], averaged[rows], held)
 
 

@@ -105,13 +105,13 @@ def pictures_of(
     half: Half,
     before: Point,
     after: Point,
-    every: int,
+    thinning: int,
     missing: MissingForce,
     left: MissingForce,
     friction: tuple[FrictionCurve, ...],
 ) -> Pictures:
     """
-    :param every: steps of the data in one of the windows
+    :param thinning: steps of the data in one of the windows
     :param missing: residual force of the nominal model
     :param left: residual force of the extended model
     :param friction: against velocity
@@ -129,7 +129,7 @@ def pictures_of(
         joints=tuple((j.name, "N" if j.unit == "m" else "N m") for j in twin.joints),
         actuators=tuple((a.name, a.unit) for a in twin.actuators),
         replay=replay_of(measured, before.residual[rows], after.residual[rows], rms, twin.dt),
-        steps=every * np.arange(measured.shape[1]),
+        steps=thinning * np.arange(measured.shape[1]),
         errors=np.stack(errors),
         missing=missing,
         left=left,
