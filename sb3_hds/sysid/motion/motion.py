@@ -134,7 +134,11 @@ def smoothed_motion(twin: Twin, data: Trajectories) -> Motion:
         tuple(np.stack([getattr(c, name) for c in columns], 1) for name in ("q", "v", "a"))
         for columns in found
     ]
-    mean = lambda name: np.median([[getattr(c, name) for c in cs] for cs in found], axis=0)  # noqa: E731
+
+    def typical(name: str) -> np.ndarray:
+        """Of each joint, the median over recordings."""
+        return np.median([[getattr(c, name) for c in cs] for cs in found], axis=0)
+
     period = 2.0 * np.pi * _rms([v[1] for v in values]) / (_rms([v[2] for v in values]) + 1e-300)
     thinning = max(
         1, int(np.min(period[np.isfinite(period)], initial=np.inf) / (_PER_PERIOD * data.dt))
@@ -148,7 +152,7 @@ def smoothed_motion(twin: Twin, data: Trajectories) -> Motion:
         if still.any():
             measured_v[:, still] = _differences(q, data.dt, velocity_time, known)[:, still]
         recordings.append(_thinned(smoothed, measured_v, commands, thinning))
-    noise_q, noise_v = mean("noise_q"), mean("noise_v")
+    noise_q, noise_v = typical("noise_q"), typical("noise_v")
     noise_v = np.where(measured, noise_v, np.sqrt(0.5 + 6.0 * velocity_time**2) * noise_q / data.dt)
     return Motion(
         tuple(recordings),
@@ -158,9 +162,9 @@ def smoothed_motion(twin: Twin, data: Trajectories) -> Motion:
         measured,
         noise_q,
         noise_v / np.sqrt(thinning),
-        mean("error_v"),
+        typical("error_v"),
         period,
-        np.maximum(np.ceil(0.5 * mean("half") / thinning), 2.0).astype(int),
+        np.maximum(np.ceil(0.5 * typical("half") / thinning), 2.0).astype(int),
         1.0 if velocity_time == 0.0 else 1.0 - 1.0 / (twin.substeps * thinning),
         np.array([2.0 * np.pi if joint.unit == "rad" else np.inf for joint in twin.joints]),
         measured & kinematics([(q, v) for q, v, _ in logged], data.dt, period).agrees,
