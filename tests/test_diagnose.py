@@ -10,11 +10,10 @@ from measuring import jumping, measured
 
 from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import Joint, Trajectories
-from sb3_hds.sysid.comparison.halves import Half
+from sb3_hds.sysid.comparison.halves import Half, Ranking
 from sb3_hds.sysid.comparison.held_out import Comparison, split, t_or_rank_test, t_test
 from sb3_hds.sysid.comparison.inference import standard_errors, systematic
 from sb3_hds.sysid.comparison.parameter_stability import Change
-from sb3_hds.sysid.comparison.ranking import Ranking
 from sb3_hds.sysid.comparison.starts import newton
 from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
 from sb3_hds.sysid.diagnosis import residuals

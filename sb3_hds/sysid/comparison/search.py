@@ -6,10 +6,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.sysid.comparison.halves import Base, Effort, Half, Tried
+from sb3_hds.sysid.comparison.halves import Base, Effort, Half, Ranking, Tried
 from sb3_hds.sysid.comparison.held_out import LEAST_BIC, Comparison, passes
 from sb3_hds.sysid.comparison.inference import aliased_with
-from sb3_hds.sysid.comparison.ranking import Ranking
 from sb3_hds.sysid.comparison.starts import Here, guesses
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
