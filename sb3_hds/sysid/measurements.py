@@ -15,8 +15,11 @@ _OTHER_UNIT = 100.0
 # Of white noise of one, the standard deviation of fourth differences: the root of the sum of the
 # squared binomial coefficients, 1 + 16 + 36 + 16 + 1. A smooth signal has hardly any.
 _FOURTH = np.sqrt(70.0)
-# Standard deviation of normal noise, in units of its median absolute value.
-_NORMAL = 1.4826
+#: standard deviation of normal noise, in units of its median absolute value: the reciprocal of the
+#: third quartile of the normal distribution
+NORMAL = 1.4826
+#: with fewer recordings, about so many stretches of them are the clusters of correlated errors
+FEWEST_CLUSTERS, N_STRETCHES = 8, 16
 # Rows of a recording from which fourth differences are taken.
 _FEWEST_ROWS = 6
 
@@ -29,7 +32,7 @@ def white_noise(recordings: Sequence[Float[np.ndarray, "rows *k"]]) -> Float[np.
     fourth = [np.diff(x, 4, axis=0) for x in recordings if len(x) >= _FEWEST_ROWS]
     if not fourth:
         return np.zeros(recordings[0].shape[1:])
-    return np.asarray(_NORMAL * np.median(np.abs(np.concatenate(fourth)), axis=0) / _FOURTH)
+    return np.asarray(NORMAL * np.median(np.abs(np.concatenate(fourth)), axis=0) / _FOURTH)
 
 
 def channel_deviations(data: Trajectories) -> Float[np.ndarray, " obs"]:

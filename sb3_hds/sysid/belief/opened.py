@@ -11,7 +11,7 @@ from sb3_hds.core import Trajectories, Twin
 from sb3_hds.sysid.belief.answers import Answer, Answers, everything_open, factor_of
 from sb3_hds.sysid.comparison.halves import Accepted, Base, Half
 from sb3_hds.sysid.comparison.held_out import effective_size
-from sb3_hds.sysid.comparison.inference import jackknife
+from sb3_hds.sysid.comparison.inference import RANK, jackknife
 from sb3_hds.sysid.comparison.search import Search, places_of
 from sb3_hds.sysid.equation.plausibility import rarity_of
 from sb3_hds.sysid.estimation.candidates import Candidate
@@ -23,8 +23,6 @@ MOST = 6
 _WINDOW = 20
 # Number of candidates that stand in for an unexplained residual.
 _NEAREST = 3
-# Directions below this share of the largest curvature are ignored.
-_RANK = 1e-10
 # Step of the difference by which the twin's parameters follow a candidate's, in typical deviations:
 # they are linear in it.
 _STEP = 1e-4
@@ -143,7 +141,7 @@ def joint_covariance(half: Half, point: Point, free: Sequence[int]) -> np.ndarra
     # With fewer clusters than parameters, the jackknife covers only some directions.
     if np.isfinite(covariance).all() and len(np.unique(half.cluster)) <= len(free):
         total = slopes.curvature.sum(0)
-        covariance = covariance + np.linalg.pinv(total, rcond=_RANK, hermitian=True)
+        covariance = covariance + np.linalg.pinv(total, rcond=RANK, hermitian=True)
     return covariance * np.outer(scale, scale)
 
 

@@ -20,11 +20,12 @@ from sb3_hds.sysid.comparison.held_out import (
 )
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point
+from sb3_hds.sysid.estimation.normal_equations import DIVERGED
 
 # Candidates that may be confirmed, one after the other.
 _MOST_LOOKS = 3
-# Mean square error of a window that cannot be simulated, in units of the noise.
-NOT_FINITE = 1e8
+#: mean square error of a window that cannot be simulated, in units of the noise
+NOT_FINITE = DIVERGED**2
 
 
 class Half(NamedTuple):

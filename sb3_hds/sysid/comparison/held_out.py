@@ -7,15 +7,14 @@ import scipy
 from jaxtyping import Float, Int
 
 from sb3_hds.core import Trajectories
+from sb3_hds.sysid.estimation.normal_equations import CONFIDENCE, DIVERGED
+from sb3_hds.sysid.measurements import FEWEST_CLUSTERS, N_STRETCHES
 
-# With fewer recordings, stretches of them are the clusters, about so many.
-_FEWEST_CLUSTERS, _N_STRETCHES = 8, 16
 # Ratios of errors beyond this say no more.
 _MOST_RATIO = 1e6
-# By which factor the level of the test on windows is stricter than that on clusters.
-_STRICTER = 25.0
-# Errors beyond this, in units of the noise, say no more.
-_MOST_ERROR = 1e4
+#: by which factor the level of a test on windows is stricter than that on clusters: windows of one
+#: recording are not independent
+STRICTER = 25.0
 # What confirms a candidate: by which share the mean square error of held-out recordings falls, at
 # which level, and by how much the information criterion of the others.
 LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 6.0
@@ -73,7 +72,7 @@ def t_test(
         return Comparison(float(1.0 - np.exp(-ratio.mean())), 1.0, -np.inf, 1.0, n)
     stderr = max(ratio.std(ddof=1) / np.sqrt(n), 1e-12)
     p_value = float(scipy.stats.t.sf(ratio.mean() / stderr, n - 1))
-    half = scipy.stats.t.ppf(0.95, n - 1) * stderr
+    half = scipy.stats.t.ppf(0.5 + 0.5 * CONFIDENCE, n - 1) * stderr
     low, gain, high = 1.0 - np.exp(-ratio.mean() - np.array([-half, 0.0, half]))
     return Comparison(float(gain), p_value, float(low), float(high), n)
 
@@ -93,7 +92,7 @@ def t_or_rank_test(
     if not np.any(ratio):
         return comparison
     by_window: Any = scipy.stats.wilcoxon(ratio, alternative="greater")
-    return comparison._replace(p_value=min(comparison.p_value, _STRICTER * float(by_window.pvalue)))
+    return comparison._replace(p_value=min(comparison.p_value, STRICTER * float(by_window.pvalue)))
 
 
 def by_scores(
@@ -125,7 +124,7 @@ def by_scores(
     if len(labels) < 2:
         return 1.0
     before, after = (
-        np.clip(np.nan_to_num(r, nan=_MOST_ERROR), -_MOST_ERROR, _MOST_ERROR) for r in (old, new)
+        np.clip(np.nan_to_num(r, nan=DIVERGED), -DIVERGED, DIVERGED) for r in (old, new)
     )
     leans, noise = (np.sum((before - after) * r, (1, 2)) for r in (before, after))
     by_cluster = np.array([noise[cluster == label].sum() for label in labels])
@@ -148,7 +147,7 @@ def split(data: Trajectories, origin: Int[np.ndarray, " n"], seed: int) -> Split
     """
     recordings = np.unique(origin[origin >= 0])
     cluster = origin.copy()
-    if len(recordings) < _FEWEST_CLUSTERS:
+    if len(recordings) < FEWEST_CLUSTERS:
         cluster = _in_blocks(origin, recordings)
     rng, held_out = np.random.default_rng(seed), np.zeros(len(origin), bool)
     labels = np.unique(cluster[cluster >= 0])
@@ -178,7 +177,7 @@ def effective_size(residual: Float[np.ndarray, "n rows obs"]) -> float:
 def _in_blocks(origin: np.ndarray, recordings: np.ndarray) -> np.ndarray:
     """Stretches of recordings, about as many windows each."""
     cluster, label = np.full(len(origin), -1), 0
-    n_blocks = -(-_N_STRETCHES // max(len(recordings), 1))
+    n_blocks = -(-N_STRETCHES // max(len(recordings), 1))
     for recording in recordings:
         for rows in np.array_split(np.flatnonzero(origin == recording), n_blocks):
             if len(rows):

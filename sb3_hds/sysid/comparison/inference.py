@@ -11,10 +11,10 @@ from sb3_hds.sysid.comparison.held_out import LEAST_GAIN
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, Slopes
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
+from sb3_hds.sysid.estimation.normal_equations import CONFIDENCE
 
-_CONFIDENCE = 0.9
-# Directions below this share of the largest curvature do not move.
-_RANK = 1e-10
+#: directions below this share of the largest curvature are not determined, where it is inverted
+RANK = 1e-10
 # Cosine of the angle between what two causes do beyond which they look alike.
 _IMITATION = 0.95
 # How close to the wanted rise of the cost is close enough (in its root), and how often to try.
@@ -25,8 +25,8 @@ _FARTHER, _NEARER = 3.0, 0.2
 _STEPS = 6
 # Draws of the bootstrap, and how many at a time, so that memory stays small.
 _N_DRAWS, _AT_A_TIME = 999, 250
-# Directions below this share of the largest curvature do not move.
-_WEAK = 1e-9
+#: directions below this share of the largest curvature do not move
+WEAK = 1e-9
 
 
 def jackknife(slopes: Slopes, cluster: Int[np.ndarray, " n"]) -> Float[np.ndarray, "p p"]:
@@ -48,7 +48,7 @@ def jackknife(slopes: Slopes, cluster: Int[np.ndarray, " n"]) -> Float[np.ndarra
     covariance = np.zeros_like(total)
     for label in labels:
         own = cluster == label
-        rest = np.linalg.pinv(total - slopes.curvature[own].sum(0), rcond=_RANK, hermitian=True)
+        rest = np.linalg.pinv(total - slopes.curvature[own].sum(0), rcond=RANK, hermitian=True)
         step = rest @ slopes.scores[own].sum(0)
         # Infinite is right: one cluster alone knows of it.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -82,7 +82,7 @@ def detectable(half: Half, point: Point) -> dict[str, dict[str, float]]:
     numbers = point.residual.shape[1] * point.residual.shape[2]
     needed = 0.5 * LEAST_GAIN * half.total(point) * numbers
     nuisances, found = list(h.nuisances), {}
-    inner = np.linalg.pinv(total[np.ix_(nuisances, nuisances)], rcond=_RANK)
+    inner = np.linalg.pinv(total[np.ix_(nuisances, nuisances)], rcond=RANK)
     for candidate in h.candidates:
         sizes = {}
         for name, i in zip(candidate.parameters, h.indices(candidate), strict=True):
@@ -128,7 +128,7 @@ def aliased_with(
         they and the cause change in these windows exceeds 0.95, to first order
     """
     total, rest = slopes.curvature.sum(0), list(nuisances)
-    inner = np.linalg.pinv(total[np.ix_(rest, rest)], rcond=_RANK, hermitian=True)
+    inner = np.linalg.pinv(total[np.ix_(rest, rest)], rcond=RANK, hermitian=True)
     total = total - total[:, rest] @ inner @ total[rest]
     own = list(h.indices(found))
     direction = ((point.theta - h.null) / h.scale)[own]
@@ -166,7 +166,7 @@ def profiled(
     h = evidence.hypotheses
     others = [i for i in free if i != index]
     curvature = evidence.slopes(point, [index, *others]).curvature.sum(0)
-    inner = np.linalg.pinv(curvature[1:, 1:], rcond=_RANK, hermitian=True)
+    inner = np.linalg.pinv(curvature[1:, 1:], rcond=RANK, hermitian=True)
     along = curvature[0, 0] - curvature[0, 1:] @ inner @ curvature[1:, 0]
     rise = 0.5 * max(along, 0.0) * (reach / h.scale[index]) ** 2
     best = point.theta[index]
@@ -195,7 +195,7 @@ def profiled(
 
 def margin(n_clusters: int, stderr: np.ndarray) -> np.ndarray:
     """:return: half the width of a symmetric interval"""
-    return scipy.stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, max(n_clusters - 1, 1)) * stderr
+    return scipy.stats.t.ppf(0.5 + 0.5 * CONFIDENCE, max(n_clusters - 1, 1)) * stderr
 
 
 def interval(
@@ -257,14 +257,14 @@ def family_p_value(
     """
     scores, curvature = slopes.scores, slopes.curvature.sum(0)
     fixed = list(free)
-    inner = np.linalg.pinv(curvature[np.ix_(fixed, fixed)], rcond=_WEAK, hermitian=True)
+    inner = np.linalg.pinv(curvature[np.ix_(fixed, fixed)], rcond=WEAK, hermitian=True)
     onto = curvature[:, fixed] @ inner
     scores = scores - scores[:, fixed] @ onto.T
     n = len(scores)
     scores = (scores - scores.mean(0)) * n / max(n - len(fitted), 1)
     curvature = curvature - onto @ curvature[fixed]
     sizes = [
-        (list(own), np.linalg.pinv(curvature[np.ix_(own, own)], rcond=_WEAK, hermitian=True))
+        (list(own), np.linalg.pinv(curvature[np.ix_(own, own)], rcond=WEAK, hermitian=True))
         for own in candidates
     ]
     rng, as_large = np.random.default_rng(seed), 1

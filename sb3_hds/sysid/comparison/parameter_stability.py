@@ -7,15 +7,14 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
+from sb3_hds.sysid.comparison.held_out import STRICTER
+from sb3_hds.sysid.comparison.inference import RANK
 from sb3_hds.sysid.comparison.unexplained import MissingForce, ShortWindows
 
 # Waves over the ranks of a quantity with which a size may change, and the level at which it does.
 _WAVES, _LEVEL = 4, 0.01
-# Factor by which p-values are larger, because windows of one recording are not independent.
-_STRICTER = 25.0
-# Directions below this share of the largest curvature are ignored; least share of the information
-# that remains when one window is left out.
-_RANK, _LEAST_OF_OTHERS = 1e-10, 1e-9
+# Least share of the information that remains when one window is left out.
+_LEAST_OF_OTHERS = 1e-9
 
 
 class Change(NamedTuple):
@@ -57,7 +56,7 @@ def change(
     for parameter in (list(free).index(i) for i in own):
         for name, values in quantities:
             tested = _tested(slopes.curvature, slopes.scores, parameter, _waves(values))
-            found.append(Change(name, min(_STRICTER * n_tests * tested.p_value, 1.0), tested.gain))
+            found.append(Change(name, min(STRICTER * n_tests * tested.p_value, 1.0), tested.gain))
     sure = [one for one in found if one.p_value < _LEVEL]
     return max(sure, key=lambda one: one.gain, default=None)
 
@@ -74,11 +73,11 @@ def _tested(
     waves: Float[np.ndarray, "n k"],
 ) -> _Tested:
     at = parameter
-    whole = np.linalg.pinv(curvature.sum(0), rcond=_RANK, hermitian=True)
+    whole = np.linalg.pinv(curvature.sum(0), rcond=RANK, hermitian=True)
     cross = np.einsum("nf,nk->fk", curvature[:, :, at], waves)
     inner = np.einsum("n,nk,nl->kl", curvature[:, at, at], waves, waves)
     follows = whole @ cross
-    free = np.linalg.pinv(inner - cross.T @ follows, rcond=_RANK, hermitian=True)
+    free = np.linalg.pinv(inner - cross.T @ follows, rcond=RANK, hermitian=True)
 
     # How each window's scores change with the waves, the fitted parameters compensating.
     moves = np.zeros((*waves.shape, curvature.shape[1]))
@@ -94,7 +93,7 @@ def _tested(
     left_out = np.einsum("nkf,nfg,nlg->nkl", moves, curvature, moves) @ free
     others = (1.0 + _LEAST_OF_OTHERS) * np.eye(waves.shape[1]) - left_out
     noise = np.linalg.solve(others, by_window(then)[..., None])[..., 0]
-    statistic = float(slope @ np.linalg.pinv(noise.T @ noise, rcond=_RANK, hermitian=True) @ slope)
+    statistic = float(slope @ np.linalg.pinv(noise.T @ noise, rcond=RANK, hermitian=True) @ slope)
     # Part of the gain is due to noise: as much as the waves gain of the statistic.
     n_waves, gained = waves.shape[1], float(slope @ free @ slope)
     real = max(1.0 - n_waves / statistic, 0.0) if statistic else 0.0

@@ -14,6 +14,7 @@ from sb3_hds.sysid.equation.members import Member
 from sb3_hds.sysid.equation.plausibility import rarity_of
 from sb3_hds.sysid.equation.screening import Screened
 from sb3_hds.sysid.equation.selection import LATE
+from sb3_hds.sysid.equation.weak_form import FOLDS
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point, in_threads
 from sb3_hds.sysid.estimation.shooting import evenly
@@ -30,8 +31,6 @@ _MANY = 6
 _ROUGH_STEPS = 2
 # Windows of a large machine on which each member of its set is left out once.
 _SOME_WINDOWS = 8
-# Folds of the data on which the equation's t is based.
-_FREEDOM = 7
 
 
 def proposed_set(search: Search, screened: Screened, start: Base) -> Base:
@@ -288,7 +287,7 @@ def _accepted(
     equal = [k for k in others if k not in worse and k not in members]
     # The equation has chosen among all candidates, not only among those that are simulated.
     n_candidates = len(judged.screened.hypotheses.candidates)
-    p_value = float(scipy.stats.t.sf(member.t, _FREEDOM)) * n_candidates
+    p_value = float(scipy.stats.t.sf(member.t, FOLDS - 1)) * n_candidates
     return Accepted(
         Tried(candidate, base.point, base.held_out, member.gain),
         judged.verdicts[key],

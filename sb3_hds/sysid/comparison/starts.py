@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from sb3_hds.sysid.comparison.inference import WEAK
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, in_threads
 
@@ -18,9 +19,8 @@ _DISTANCES = (0.1, 0.3, 1.0, 3.0)
 _FITTED, _LEAST_STEPS = 3, 8
 # A Newton step promises nothing beyond, in the same units.
 _FARTHEST = 10.0
-# Curvature, per measurement, below which there is no slope; directions below this share of the
-# largest curvature do not move.
-_FLAT, _RANK = 1e-15, 1e-9
+# Curvature, per measurement, below which there is no slope.
+_FLAT = 1e-15
 
 
 class Guess(NamedTuple):
@@ -98,7 +98,7 @@ def newton(
     """
     step = np.zeros(len(score))
     while moving:
-        inner = np.linalg.pinv(curvature[np.ix_(moving, moving)], rcond=_RANK, hermitian=True)
+        inner = np.linalg.pinv(curvature[np.ix_(moving, moving)], rcond=WEAK, hermitian=True)
         step[moving] -= inner @ (score + curvature @ step)[moving]
         wanted, allowed = step[moving], np.clip(step[moving], room[0][moving], room[1][moving])
         step[moving] = allowed

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sb3_hds.core import Joint, Trajectories
-from sb3_hds.sysid.comparison.held_out import Split, split
+from sb3_hds.sysid.comparison.held_out import STRICTER, Split, split
 from sb3_hds.sysid.estimation.evidence import Evidence, Point, Slopes
 from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
 from sb3_hds.sysid.motion.joints import motion_of
@@ -26,8 +26,6 @@ _RIDGES = (0.1, 1.0, 10.0, 100.0)
 _LEAST_GAIN, _LEVEL = 0.05, 0.01
 # Patterns of signs: all of so many clusters, or so many drawn.
 _ALL_SIGNS_OF, _N_FLIPS = 12, 4096
-# By which factor the level of the test on windows is stricter than that on clusters.
-_STRICTER = 25.0
 # A smaller set of quantities that explains this share of what all explain tells where it lives.
 _MOST_OF_IT = 0.8
 _MOST_RATIO = 4.0
@@ -298,7 +296,7 @@ def _by_chance(
     by_cluster = np.stack(
         [agreement[..., cluster == label].sum(-1) for label in np.unique(cluster)], -1
     )
-    return np.minimum(_by_flips(by_cluster), _STRICTER * _by_flips(agreement))
+    return np.minimum(_by_flips(by_cluster), STRICTER * _by_flips(agreement))
 
 
 def _by_flips(

@@ -11,8 +11,8 @@ from sb3_hds.sysid.equation.held_out_folds import equivalents, held_out_gain
 from sb3_hds.sysid.equation.plausibility import plausibility
 from sb3_hds.sysid.equation.problem import Problem
 from sb3_hds.sysid.equation.regression import Equation, Item, Solution
+from sb3_hds.sysid.estimation.normal_equations import CONFIDENCE
 
-_CONFIDENCE = 0.9
 # Factor by which intervals are wider than cluster-robust ones: sets are rarely complete, and sizes
 # compensate for what is missing. Chosen on other simulated machines than those of
 # benchmarks/hidden_effects.py, which measures the coverage.
@@ -63,7 +63,7 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
     """
     found = p.solve(keys)
     covariance = _covariance(p, keys, found)
-    quantile = scipy.stats.t.ppf(0.5 + _CONFIDENCE / 2.0, max(len(p.grams.blocks) - 1, 5))
+    quantile = scipy.stats.t.ppf(0.5 + CONFIDENCE / 2.0, max(len(p.grams.blocks) - 1, 5))
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     stderr = dict(zip(found.free, errors, strict=True))
     base, held, out = p.score(keys, priced=False), p.held_out(keys), []
@@ -164,7 +164,7 @@ def _doubt(
             there = item.sizes(effect, [value[c] for c in item.free])
             for name in squares:
                 squares[name] += weight * (there[name] - sizes[name]) ** 2
-    quantile = scipy.stats.norm.ppf(0.5 + _CONFIDENCE / 2.0)
+    quantile = scipy.stats.norm.ppf(0.5 + CONFIDENCE / 2.0)
     return {name: float(quantile * np.sqrt(square)) for name, square in squares.items()}
 
 

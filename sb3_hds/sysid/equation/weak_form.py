@@ -39,7 +39,7 @@ _AVERAGED, _NARROW, _NO_NOISE = 0.5, 3.0, 0.05
 # Huber's threshold, in units of the noise, and number of reweightings.
 _HUBER, _PASSES = 2.0, 4
 # Clusters: at least this many recordings, or pieces of them; and folds of held-out data.
-_BLOCKS, _FOLDS = 16, 8
+_BLOCKS, FOLDS = 16, 8
 # Largest ratio of cluster-robust to naive variances.
 _MOST_DEFLATION = 10.0
 # Effects that the rich model of the noise leaves out: with them, it would fit trivially, 0 = 0.
@@ -251,7 +251,7 @@ def grams(equation: Equation) -> Grams:
     n_blocks = (int(equation.rows.recording.max()) + 1) * pieces
     blocks = np.zeros((n_blocks, n_columns + 1, n_columns + 1))
     by_joint = np.zeros((dof, n_columns + 1, n_columns + 1))
-    n_folds = min(_FOLDS, n_blocks)
+    n_folds = min(FOLDS, n_blocks)
     order = np.arange(n_blocks)
     fold_of = order % n_folds if pieces == 1 else order * n_folds // n_blocks
     folds = np.zeros((n_folds, dof, n_columns + 1, n_columns + 1))

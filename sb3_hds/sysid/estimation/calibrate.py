@@ -18,7 +18,7 @@ from sb3_hds.sysid.estimation.normal_equations import Uncertainty, covariance_of
 from sb3_hds.sysid.estimation.parameters import Free, free_names, nominal_values, one_each, tie
 from sb3_hds.sysid.estimation.results import Estimate, Fit
 from sb3_hds.sysid.estimation.shooting import Shots, n_free, shots_of
-from sb3_hds.sysid.measurements import channel_deviations, check_fits
+from sb3_hds.sysid.measurements import NORMAL, channel_deviations, check_fits
 
 # Length of a window where none is given [s], within these numbers of steps.
 _WINDOW = 0.5
@@ -249,7 +249,7 @@ def _noise(
     """Robust standard deviation of each channel's error, from the median."""
     error = residual.reshape(-1, residual.shape[-1])
     freedom = error.size / max(error.size - n_params - n_start * len(residual), 1)
-    noise = 1.4826 * np.median(np.abs(error), 0) * np.sqrt(freedom)
+    noise = NORMAL * np.median(np.abs(error), 0) * np.sqrt(freedom)
     return np.maximum(noise, _LEAST_NOISE * deviations)
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from sb3_hds.core import AnalyticTwin, State, Trajectories, Twin
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.sysid.estimation.parameters import one_each
+from sb3_hds.sysid.measurements import NORMAL
 from sb3_hds.sysid.motion.motion import smoothed_motion
 
 # Gauss-Newton steps: most parameters are linear, and need one; Huber's weights need a few.
@@ -19,7 +20,6 @@ _STEPS = 6
 _HUBER = 1.345
 #: for plain squares: beyond any error, in units of the noise
 NO_THRESHOLD = 1e12
-_NORMAL = 1.4826
 # Standard deviation of the prior around the twin's own values, in each parameter's scale: a weak
 # prior that keeps what the data do not determine.
 _BELIEF = 100.0
@@ -106,7 +106,7 @@ def by_inverse_dynamics(
 
 def _weights(missing: np.ndarray, threshold: float) -> np.ndarray:
     size = np.abs(missing)
-    noise = np.maximum(_NORMAL * np.median(size, 0), 1e-12 * size.max() + 1e-300)
+    noise = np.maximum(NORMAL * np.median(size, 0), 1e-12 * size.max() + 1e-300)
     return np.sqrt(np.minimum(1.0, threshold * noise / np.maximum(size, 1e-300))) / noise
 
 

@@ -6,8 +6,10 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
-# Error of a simulation that is not finite, in units of the noise.
-_NOT_FINITE = 1e4
+#: error of a simulation that is not finite, in units of the noise: larger ones say no more
+DIVERGED = 1e4
+#: level of the intervals of a diagnosis
+CONFIDENCE = 0.9
 # Added to curvatures, relative to their trace, so that parameters without influence stay.
 _RIDGE = 1e-9
 # With fewer recordings than this more than there are parameters, windows count as independent.
@@ -70,7 +72,7 @@ def normal_equations(
     """
     n = len(residual)
     finite = np.isfinite(residual)
-    error = np.where(finite, residual / noise, _NOT_FINITE) * counted[:, None]
+    error = np.where(finite, residual / noise, DIVERGED) * counted[:, None]
     size = np.abs(error)
     small = np.minimum(size, threshold)
     cost = np.sum(0.5 * small**2 + threshold * (size - small), (1, 2))

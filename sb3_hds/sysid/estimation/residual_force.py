@@ -18,7 +18,7 @@ from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.estimation.calibrate import default_window
 from sb3_hds.sysid.estimation.prediction import hold_out, is_better, start_states, window_errors
 from sb3_hds.sysid.estimation.shooting import Shots, places_and_ages_of, shots_of, simulate
-from sb3_hds.sysid.measurements import channel_deviations, check_fits
+from sb3_hds.sysid.measurements import NORMAL, channel_deviations, check_fits
 
 # Unit of errors where the noise is not known, in standard deviations of a channel.
 _UNIT_ERROR = 0.05
@@ -220,7 +220,7 @@ def _normalised(
     scale = jnp.std(inputs, 0)
     masses = jax.vmap(jax.vmap(lambda q: jnp.diag(plant.mass_matrix(q, twin.params))))(q)
     pushed = masses[:, :-1] * jnp.diff(v, axis=1) / twin.dt
-    inertial = jnp.median(jnp.abs(pushed), (0, 1)) * 1.4826
+    inertial = jnp.median(jnp.abs(pushed), (0, 1)) * NORMAL
     size = jnp.where(inertial > 0.0, _OUTPUT * inertial, 1.0)
     return force.fresh(jax.random.key(seed)) | {
         "input_mean": jnp.mean(inputs, 0),

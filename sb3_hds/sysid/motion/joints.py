@@ -12,14 +12,13 @@ from jaxtyping import Array, Float
 from sb3_hds.core import Params, Trajectories, Twin, explicit_euler, semi_implicit_euler
 from sb3_hds.core.numerics.compilation import QUICKEST_COMPILATION
 from sb3_hds.core.twin import plant_of
+from sb3_hds.sysid.measurements import FEWEST_CLUSTERS, N_STRETCHES
 
 # Samples that give the first velocity, and that show whether velocities are measured at all.
 _FEW, _SOME = 5, 50
 # Positions and velocities are compared over this share of a period; they disagree by more than this
 # many standard errors and this share of the speed or scale.
 _PART, _SURE, _SCALE = 0.25, 4.0, 0.005
-# With fewer recordings, about so many stretches of them are the clusters of correlated errors.
-_FEWEST_CLUSTERS, _N_STRETCHES = 8, 16
 # All rows but the last, and all but the first.
 _PAIRS = (slice(None, -1), slice(1, None))
 
@@ -217,12 +216,12 @@ def kinematics(
         size = np.sqrt(np.mean(table**2, 0)) + 1e-300
         inverse = np.linalg.pinv((table / size).T @ (table / size))
         theta[j] = inverse @ (table / size).T @ right / size
-        few = len(tables) < _FEWEST_CLUSTERS
+        few = len(tables) < FEWEST_CLUSTERS
         scores = [
             part.sum(0)
             for x, y in zip(tables, rights, strict=True)
             for part in _stretches(
-                x * (y - x @ theta[j])[:, None], -(-_N_STRETCHES // len(tables)) if few else 1
+                x * (y - x @ theta[j])[:, None], -(-N_STRETCHES // len(tables)) if few else 1
             )
         ]
         n = len(scores)
