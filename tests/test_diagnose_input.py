@@ -1,5 +1,7 @@
 """What `diagnose` is given by mistake, or for a second time: a clear answer each."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from cases import each
@@ -9,6 +11,7 @@ from sb3_hds import diagnose, effects, twins
 from sb3_hds.core import NO_EFFECTS, JointEffect, Trajectories
 from sb3_hds.data import SamplingWarning
 from sb3_hds.errors import CalibrationError, EffectError
+from sb3_hds.sysid.diagnosis.preparation import hash_of
 from sb3_hds.sysid.measurements import check_fits
 
 FRICTION = (effects.ViscousFriction, effects.CoulombFriction)
@@ -146,3 +149,24 @@ def test_an_interval_that_a_log_cannot_tell_from_the_twins_is_the_same():
         else:
             with pytest.raises(CalibrationError, match=r"steps by 0\.0333333 s and the data are"):
                 check_fits(twin, data)
+
+
+def test_a_checksum_tells_recordings_apart_that_have_the_same_numbers():
+    obs, actions = np.arange(24.0).reshape(2, 3, 4), np.zeros((2, 2, 1))
+    same, again = (Trajectories.from_arrays(obs, actions, dt=0.1) for _ in range(2))
+    others = [
+        Trajectories.from_arrays(obs, actions, dt=0.2),
+        Trajectories.from_arrays(obs, actions, dt=0.1, conditions=["light", "heavy"]),
+        dataclasses.replace(same, origin=np.zeros(2, int)),
+    ]
+
+    assert hash_of(same) == hash_of(again)
+    assert len({hash_of(data) for data in (same, *others)}) == 4
+
+
+def test_a_checksum_knows_the_shape_of_what_is_all_zero():
+    one, other = (
+        Trajectories.from_arrays(np.zeros((2, 3, n_obs)), np.zeros((2, 2, n_act)), dt=0.1)
+        for n_obs, n_act in ((3, 0), (1, 3))
+    )
+    assert hash_of(one) != hash_of(other)

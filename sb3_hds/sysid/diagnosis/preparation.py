@@ -244,9 +244,10 @@ def prepare(
 
 
 def hash_of(data: Trajectories) -> str:
-    """:return: a checksum of the recordings"""
-    digest = hashlib.sha256()
-    for leaf in (data.obs, data.actions, data.mask):
+    """:return: a checksum of the recordings: values and shapes, interval, origins and conditions"""
+    digest = hashlib.sha256(repr((float(data.dt), data.conditions)).encode())
+    for leaf in map(np.asarray, (data.obs, data.actions, data.mask, data.origin)):
+        digest.update(repr(leaf.shape).encode())
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()[:16]
 
