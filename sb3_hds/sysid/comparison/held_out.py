@@ -16,7 +16,9 @@ _MOST_RATIO = 1e6
 #: recording are not independent
 STRICTER = 25.0
 # What confirms a candidate: by which share the mean square error of held-out recordings falls, at
-# which level, and by how much the information criterion of the others.
+# which level (one-sided: 5 % of a two-sided test), and by how much the information criterion of the
+# others. A difference of 6 is strong evidence: Kass and Raftery, Bayes factors, J. American
+# Statistical Association 90, 1995.
 LEAST_GAIN, LEVEL, LEAST_BIC = 0.05, 0.025, 6.0
 # Another candidate belongs into the set unless it is worse than the best at this level.
 _LEVEL_OF_SET = 0.05

@@ -15,7 +15,7 @@ from sb3_hds.sysid.estimation.normal_equations import CONFIDENCE
 
 #: directions below this share of the largest curvature are not determined, where it is inverted
 RANK = 1e-10
-# Cosine of the angle between what two causes do beyond which they look alike.
+# Cosine of the angle between what two causes do beyond which they look alike: 18 degrees.
 _IMITATION = 0.95
 # How close to the wanted rise of the cost is close enough (in its root), and how often to try.
 _CLOSE, _MOST_TRIES = 0.1, 5

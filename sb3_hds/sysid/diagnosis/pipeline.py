@@ -50,7 +50,10 @@ _LEAST_OF_SEVERAL = 0.5
 # Candidates that are fitted to the end to settle the noise.
 _FOR_NOISE = 3
 # How long to search.
-EFFORTS = {"full": Effort(12, 8, 256, 4, True), "quick": Effort(8, 4, 64, 2, False)}
+EFFORTS = {
+    "full": Effort(guessed=12, finalists=8, windows=256, steps=4, profiles=True),
+    "quick": Effort(guessed=8, finalists=4, windows=64, steps=2, profiles=False),
+}
 # Errors count as noise up to here: what runs away says nothing of it.
 _WORST = 10.0
 

@@ -32,8 +32,8 @@ from sb3_hds.sysid.progress import Bar
 # Length of a window in periods of the motion, within these numbers of steps; it is half as long
 # where there would be fewer windows than that.
 _WINDOW, _SHORTEST, _LONGEST, _FEW = 0.75, 8, 200, 24
-# Logarithm of how much an error of a start state may grow within a window: where it grows more,
-# some windows are fitted by another motion than the one that was measured.
+# Logarithm of how much an error of a start state may grow within a window, 55 times: where it grows
+# more, some windows are fitted by another motion than the one that was measured.
 _GROWTH = 4.0
 # Windows of each half that are simulated, where machines have more joints than a few: each joint
 # makes each more expensive.

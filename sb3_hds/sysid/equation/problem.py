@@ -17,7 +17,8 @@ from sb3_hds.sysid.estimation.candidates import PARAMETER
 # A value close to a node between two pieces of a chain, each a linear approximation, may be outside
 # of both by this share of a piece.
 _BEYOND_NODE = 0.1
-# Variance inflation of a coefficient beyond which columns count as collinear.
+# Variance inflation of a coefficient beyond which columns count as collinear: 1 / (1 - R^2), where
+# the others explain 99.5 % of its column.
 _MOST_INFLATION = 200.0
 # Least share of the logged command or the inertia that counts as left by a set.
 _LEAST_LEFT = 0.02

@@ -28,7 +28,8 @@ from sb3_hds.sysid.motion.motion import Motion
 # joint.
 _SINGLES, _OF_A_JOINT = 10, 5
 # Detection limit: share of the nominal model's residual that a cause explains, and by how much it
-# exceeds its price, in -2 log likelihood.
+# exceeds its price, in -2 log likelihood: the least gain and the least information gain by which
+# simulations confirm a cause.
 _EXPLAINED, _MARGIN = 0.05, 6.0
 # Share of a joint's force that a typical size changes.
 _TYPICAL = 0.05

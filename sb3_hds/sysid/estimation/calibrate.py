@@ -13,7 +13,12 @@ from sb3_hds.core.numerics.compilation import keep_programs
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
-from sb3_hds.sysid.estimation.inverse_dynamics import NO_THRESHOLD, Forces, by_inverse_dynamics
+from sb3_hds.sysid.estimation.inverse_dynamics import (
+    HUBER,
+    NO_THRESHOLD,
+    Forces,
+    by_inverse_dynamics,
+)
 from sb3_hds.sysid.estimation.normal_equations import Uncertainty, covariance_of
 from sb3_hds.sysid.estimation.parameters import Free, free_names, nominal_values, one_each, tie
 from sb3_hds.sysid.estimation.results import Estimate, Fit
@@ -26,8 +31,6 @@ _SHORTEST, _LONGEST = 5, 50
 # Noise that the first pass assumes, and the least noise, in shares of a channel's standard
 # deviation.
 _FIRST_NOISE, _LEAST_NOISE = 0.05, 1e-7
-# Huber's threshold, in units of the noise: 95 % as efficient as least squares on Gaussian noise.
-_HUBER = 1.345
 _PASSES = 3
 # Steps that fit start states alone. The search ends with a step that changes the log likelihood by
 # less than this: it moves estimates by a fraction of their standard errors.
@@ -103,7 +106,7 @@ def calibrate(
     if not 0.0 < level < 1.0:
         raise CalibrationError(f"level must lie between 0 and 1, got {level}.")
     shots, origin = shots_of(data, window or default_window(data), twin, n_windows, seed)
-    threshold = _HUBER if loss == "huber" else NO_THRESHOLD
+    threshold = HUBER if loss == "huber" else NO_THRESHOLD
     if errors == "force":
         return _fit_forces(twin, wanted, data, shots, origin, threshold, level)
     return fit_windows(
@@ -127,7 +130,7 @@ def fit_windows(
     origin: np.ndarray,
     deviations: Float[np.ndarray, " obs"],
     *,
-    threshold: float = _HUBER,
+    threshold: float = HUBER,
     prior: float = 0.0,
     believed: Float[np.ndarray, " p"] | None = None,
     level: float = 0.95,

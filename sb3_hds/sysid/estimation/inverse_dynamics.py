@@ -17,7 +17,8 @@ from sb3_hds.sysid.motion.motion import smoothed_motion
 
 # Gauss-Newton steps: most parameters are linear, and need one; Huber's weights need a few.
 _STEPS = 6
-_HUBER = 1.345
+#: Huber's threshold, in units of the noise: 95 % as efficient as least squares on Gaussian noise
+HUBER = 1.345
 #: for plain squares: beyond any error, in units of the noise
 NO_THRESHOLD = 1e12
 # Standard deviation of the prior around the twin's own values, in each parameter's scale: a weak
@@ -56,7 +57,7 @@ class Forces(NamedTuple):
 
 
 def by_inverse_dynamics(
-    twin: Twin, groups: tuple[tuple[str, ...], ...], data: Trajectories, threshold: float = _HUBER
+    twin: Twin, groups: tuple[tuple[str, ...], ...], data: Trajectories, threshold: float = HUBER
 ) -> Forces | None:
     r"""
     Least squares on the residual of the equation of motion,
