@@ -223,7 +223,7 @@ class Inquiry:
 
     def _least_errors(self) -> np.ndarray:
         """:return: region of practical equivalence of each channel, or its sensor's noise"""
-        return np.maximum(IRRELEVANT * self.given.spread, self.given.sensor_noise)
+        return np.maximum(IRRELEVANT * self.given.std, self.given.sensor_noise)
 
     def wrong_convention(self, convention: Convention) -> Diagnosis:
         """:return: the verdict that the log does not follow the conventions of the model"""
@@ -253,11 +253,11 @@ class Inquiry:
         self._set_noise(min((base.point, *(t.point for t in tried)), key=lambda p: p.cost))
 
     def _set_noise(self, point: Point) -> None:
-        most = _WORST * self.given.spread
+        most = _WORST * self.given.std
         error = np.minimum(
             np.where(np.isfinite(point.residual), np.abs(point.residual), np.inf), most
         )
-        noise = np.mean(error**2, (0, 1)) + (IRRELEVANT * self.given.spread) ** 2
+        noise = np.mean(error**2, (0, 1)) + (IRRELEVANT * self.given.std) ** 2
         self._use(self.search.with_noise(np.sqrt(noise)))
 
     def _extended(self, causes: Sequence[str], theta: np.ndarray) -> Twin:
@@ -317,9 +317,7 @@ class Inquiry:
         residual = self.search.confirm.evidence.fit(
             base.point.theta, (), base.held_out.offsets
         ).residual
-        found = distances(
-            self.believed.channels, residual, self.given.sensor_noise, self.given.spread
-        )
+        found = distances(self.believed.channels, residual, self.given.sensor_noise, self.given.std)
         return far_in_words(found)
 
     def _result(

@@ -110,7 +110,7 @@ class Prepared:
     :param convention: of the model that the log does not follow; None if it follows all
     :param screened: causes by the equation of motion; None where there is no such equation
     :param hypotheses: candidates that are simulated
-    :param spread: standard deviation of each channel, shape ``(n_obs,)``
+    :param std: standard deviation of each channel, shape ``(n_obs,)``
     :param shots: windows
     :param origin: recording of each window
     :param most_windows: that are simulated of each half
@@ -127,7 +127,7 @@ class Prepared:
     convention: Convention | None
     screened: Screened | None
     hypotheses: Hypotheses
-    spread: Float[np.ndarray, " obs"]
+    std: Float[np.ndarray, " obs"]
     shots: Shots
     origin: np.ndarray
     most_windows: int
@@ -155,7 +155,7 @@ class Prepared:
         evidence = Evidence(
             self.hypotheses,
             shots[0],
-            self.spread,
+            self.std,
             width=len(self.hypotheses.nuisances) + max(_WIDEST, self._n_proposed()),
             portion=portion_for(max(own.n for own in shots)),
         )
@@ -164,10 +164,10 @@ class Prepared:
                 evidence, hypotheses=self.hypotheses.scaled(self.screened.scales)
             )
         evidence = dataclasses.replace(
-            evidence, hypotheses=sized(evidence, self.data), noise=_FIRST_NOISE * self.spread
+            evidence, hypotheses=sized(evidence, self.data), noise=_FIRST_NOISE * self.std
         )
         select, confirm = (
-            Half(evidence.on(own), self.parts.cluster[chosen], IRRELEVANT * self.spread)
+            Half(evidence.on(own), self.parts.cluster[chosen], IRRELEVANT * self.std)
             for own, chosen in zip(shots, rows, strict=True)
         )
         return select, confirm
@@ -234,7 +234,7 @@ def prepare(
         convention=convention,
         screened=screened,
         hypotheses=hypotheses,
-        spread=channel_deviations(data),
+        std=channel_deviations(data),
         shots=shots,
         origin=origin,
         most_windows=most_windows,

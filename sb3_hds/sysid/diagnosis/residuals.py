@@ -66,7 +66,7 @@ class Residuals:
         short = self._short(base.point.theta)
         missing = missing_force(short, self.given.data)
         power = float(np.mean(np.sum(weighed(missing) ** 2, 1)))
-        mind = float(np.mean((IRRELEVANT * self.given.spread / missing.noise) ** 2))
+        mind = float(np.mean((IRRELEVANT * self.given.std / missing.noise) ** 2))
         least = _OF_IRRELEVANT**2 * mind * missing.numbers
         found = remainder(missing, self.given.data, self.hypotheses.twin.joints, self.seed, least)
         # Errors of forces are known better the less is missing: two twins need one unit.

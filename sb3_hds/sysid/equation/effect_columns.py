@@ -290,8 +290,8 @@ def add_sensor(made: Equation, candidate: Candidate, effect: SensorEffect) -> No
         return  # a switch has no size
     with jax.enable_x64(True):
         observed = np.asarray(_observations(twin, jnp.asarray(rows.q), jnp.asarray(rows.v)))
-    spread = np.std(observed[:, channels[0]])
-    step = STEP * (spread if parameter.unit == "channel unit" else 1.0)
+    std = np.std(observed[:, channels[0]])
+    step = STEP * (std if parameter.unit == "channel unit" else 1.0)
     if not step > 0.0:
         return
 

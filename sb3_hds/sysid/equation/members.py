@@ -77,10 +77,10 @@ def members(p: Problem, keys: Sequence[int], effects: Mapping[str, Effect | None
         item, (_, t) = p.items[i], worths[i]
         value = found.value
         coefficients = np.array([value[c] for c in item.free])
-        spread = np.array([_INCOMPLETE * quantile * stderr.get(c, 0.0) for c in item.free])
+        reach = np.array([_INCOMPLETE * quantile * stderr.get(c, 0.0) for c in item.free])
         effect = effects.get(item.key)
         sizes, low, high = (
-            item.sizes(effect, coefficients + side * spread) for side in (0.0, -1.0, 1.0)
+            item.sizes(effect, coefficients + side * reach) for side in (0.0, -1.0, 1.0)
         )
         doubt = _doubt(item, effect, sizes, others)
         for name, least in doubt.items():
