@@ -87,7 +87,7 @@ def regression_of(screened: Any) -> Regression:
     from sb3_hds.sysid.equation.assembly import assemble
     from sb3_hds.sysid.equation.terms import terms
 
-    motion, twin = screened.motion, screened.hypotheses.believed
+    motion, twin = screened.motion, screened.hypotheses.nominal
     made = assemble(screened.hypotheses, motion)
     q, v, change, actions = (
         np.concatenate(parts)

@@ -86,7 +86,7 @@ def open_answers(
         np.asarray(search.noise, float),
         thinning * max(base.held_out.residual.size / n_effective, 1.0),
         thinning * (base.held_out.residual.shape[1] - 1),
-        _slowest(h.believed, data),
+        _slowest(h.nominal, data),
     )
 
 

@@ -47,7 +47,7 @@ def sized(evidence: Evidence, data: Trajectories) -> Hypotheses:
     if not np.any(curvature[list(h.pushes)] > 0.0):
         raise EffectError(
             f"A force at {', '.join(joint.name for joint in h.twin.joints)} moves nothing in "
-            f"{h.believed.name}: its step(state, action, params, effects) does not use the effects "
+            f"{h.nominal.name}: its step(state, action, params, effects) does not use the effects "
             "that it is given, so nothing that they do could be found. sb3_hds.core.AnalyticTwin "
             "has a step that does."
         )
@@ -107,11 +107,11 @@ def _unseen(h: Hypotheses, data: Trajectories, moved: _Moved) -> Float[np.ndarra
 
 
 def _motion(h: Hypotheses, data: Trajectories) -> _Moved:
-    parts = [motion_of(h.believed, data.episode(i)[0][None], data.dt) for i in range(len(data))]
+    parts = [motion_of(h.nominal, data.episode(i)[0][None], data.dt) for i in range(len(data))]
     q, v = (np.concatenate([part[k][0] for part in parts]) for k in (0, 1))
     change = np.concatenate([np.diff(part[1][0], axis=0) for part in parts]) / data.dt
     speeds, faster = (np.quantile(np.abs(x), 0.98, axis=0) for x in (v, change))
-    return _Moved(speeds, q.max(0) - q.min(0), faster * _inertias(h.believed, data))
+    return _Moved(speeds, q.max(0) - q.min(0), faster * _inertias(h.nominal, data))
 
 
 def _inertias(twin: Twin, data: Trajectories) -> np.ndarray:

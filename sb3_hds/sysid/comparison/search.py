@@ -328,7 +328,7 @@ class Search(NamedTuple):
     def _begin(
         self,
         candidate: Candidate,
-        believed: Point,
+        point: Point,
         free: tuple[int, ...],
         evidence: Evidence,
         places: Sequence[Place],
@@ -340,8 +340,8 @@ class Search(NamedTuple):
         blind = any(place.blind for place in places)
         tried = []
         for place in places:
-            theta, moving = believed.theta.copy(), list(self.hypotheses.indices(candidate))
-            offsets = [believed.offsets]
+            theta, moving = point.theta.copy(), list(self.hypotheses.indices(candidate))
+            offsets = [point.offsets]
             if place.free == free:
                 moving += free
                 if len(place.offsets) == evidence.shots.n:

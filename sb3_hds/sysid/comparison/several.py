@@ -35,7 +35,7 @@ _SOME_WINDOWS = 8
 
 def proposed_set(search: Search, screened: Screened, start: Base) -> Base:
     """
-    :return: what is believed with the whole set, with its sizes in the equation of motion; of a
+    :return: the model with the whole set, with its sizes in the equation of motion; of a
         small set, refitted
     """
     h, members = search.hypotheses, _members(search, screened)
@@ -49,7 +49,7 @@ def confirmed_set(
     search: Search, screened: Screened, start: Base, base: Base
 ) -> tuple[list[Accepted], Base]:
     """
-    :param start: what is believed without any cause
+    :param start: the model without any cause
     :param base: with the whole set
     :return: members without which held-out recordings are predicted worse, and the model with them;
         none where the set as a whole does not predict better
@@ -143,7 +143,7 @@ def _preferred(search: Search, rival: Tried, member: Candidate, base: Base) -> b
     :return: whether a rival without more parameters predicts surely better, or as well with better
         prior odds
     """
-    compare, twin = search.ranking.compare, search.hypotheses.believed
+    compare, twin = search.ranking.compare, search.hypotheses.nominal
     more = len(rival.candidate.parameters) - len(member.parameters)
     if more <= 0 and not as_good(compare(rival.held_out, base.held_out)):
         return True
@@ -255,7 +255,7 @@ def _each_left_out(
 
 
 def _sizes_with(search: Search, screened: Screened, start: Base, keys: Iterable[str]) -> np.ndarray:
-    """What is believed with these members only, with their sizes in the equation of motion."""
+    """The model with these members only, with their sizes in the equation of motion."""
     return _with_sizes(search, start.point.theta, screened.sizes_of(keys))
 
 
@@ -305,7 +305,7 @@ def _at_own_joint(half: Half, candidate: Candidate, new: Point, old: Point) -> C
 
 def own_channels(half: Half, candidate: Candidate) -> Sequence[int]:
     """:return: indices of the channels that tell most of a candidate"""
-    twin = half.evidence.hypotheses.believed
+    twin = half.evidence.hypotheses.nominal
     every = range(len(twin.channels))
     if candidate.slot not in ("joint", "actuator") or candidate.index < 0:
         return every

@@ -45,7 +45,7 @@ class Here(NamedTuple):
     Where one looks from.
 
     :param evidence: windows
-    :param point: what is believed, fitted to them
+    :param point: the current model, fitted to them
     :param free: indices of what is refitted whichever candidate it is
     :param steps: of fits that see whether it is better elsewhere
     """

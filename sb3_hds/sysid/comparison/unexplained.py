@@ -38,7 +38,7 @@ class ShortWindows(NamedTuple):
     Windows over which a missing force counts as constant, start states fitted.
 
     :param evidence: of windows that are lengthened to those of its program
-    :param point: what is believed, on them
+    :param point: the current model, on them
     :param shots: the windows themselves
     :param origin: recording of each, shape ``(n,)``
     :param time: since the recording began [s], shape ``(n,)``
@@ -144,7 +144,7 @@ def missing_force(short: ShortWindows, data: Trajectories) -> MissingForce:
     numbers = (steps + 1) * data.n_obs
     rest = _left_by_forces(short, slopes)
     calmer = np.sqrt(np.median(rest) / max(numbers - point.offsets.shape[1] - len(scale), 1))
-    q, v = motion_of(h.believed, shots.obs, data.dt)
+    q, v = motion_of(h.nominal, shots.obs, data.dt)
     return MissingForce(
         force=-scale * slopes.scores / informed,
         stderr=calmer * scale / np.sqrt(informed),

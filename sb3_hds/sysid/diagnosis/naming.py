@@ -243,7 +243,7 @@ class Naming:
     def _accepted(
         self, best: Tried, tried: Sequence[Tried], base: Base, p_value: float
     ) -> Accepted:
-        """:param base: what is believed without it"""
+        """:param base: the model without it"""
         rivals = [*tried, *self.search.fit_aliased(best, tried, base)]
         others = self.search.ranking.alternatives(best, rivals, base)
         comparison = self.search.ranking.compare_nested(best.held_out, base.held_out)

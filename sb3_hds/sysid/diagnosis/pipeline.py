@@ -45,7 +45,7 @@ from sb3_hds.sysid.reporting.diagnosis import Diagnosis
 from sb3_hds.sysid.reporting.finding import Rejected
 from sb3_hds.sysid.reporting.pictures import pictures_of
 
-# Several causes that explain less than this share of what can be explained are not believed.
+# Several causes that explain less than this share of what can be explained are not named.
 _LEAST_OF_SEVERAL = 0.5
 # Candidates that are fitted to the end to settle the noise.
 _FOR_NOISE = 3
@@ -81,7 +81,7 @@ class Inquiry:
         budget: str,
         progress: bool | Bar,
     ) -> None:
-        self.believed, self.seed = twin, seed
+        self.nominal, self.seed = twin, seed
         self.bar = progress if isinstance(progress, Bar) else Bar(progress)
         self.data_hash = hash_of(data)
         self.given = prepare(twin, data, effects, calibrate, seed, self.bar)
@@ -209,16 +209,16 @@ class Inquiry:
     def refused(self, reason: str) -> Diagnosis:
         return Diagnosis(
             verdict="not_identifiable",
-            believed=self.believed,
+            believed=self.nominal,
             caveats=(
                 reason,
                 *(str(found) for found in self.given.audit.findings if not found.blocks),
                 *self.given.corrected,
             ),
-            twin=self.believed,
+            twin=self.nominal,
             data_hash=self.data_hash,
             seed=self.seed,
-            opened=partial(nothing_known, self.believed, self._least_errors(), self.given.data),
+            opened=partial(nothing_known, self.nominal, self._least_errors(), self.given.data),
         )
 
     def _least_errors(self) -> np.ndarray:
@@ -229,14 +229,14 @@ class Inquiry:
         """:return: the verdict that the log does not follow the conventions of the model"""
         return Diagnosis(
             verdict="unknown",
-            believed=self.believed,
+            believed=self.nominal,
             convention=convention.key,
             unexplained=(
                 f"{convention.words} The equation of motion then leaves {convention.after:.1f} "
                 f"times the noise, not {convention.before:.0f} times. No cause was looked for."
             ),
             caveats=(*map(str, self.given.audit.findings), *self.given.corrected),
-            twin=self.believed,
+            twin=self.nominal,
             data_hash=self.data_hash,
             seed=self.seed,
         )
@@ -263,15 +263,15 @@ class Inquiry:
     def _extended(self, causes: Sequence[str], theta: np.ndarray) -> Twin:
         """:return: the twin as it came, at its own interval, with these causes in it"""
         twin = self.hypotheses.extended_by(causes, theta)
-        plant, own = plant_of(twin), plant_of(self.believed)
+        plant, own = plant_of(twin), plant_of(self.nominal)
         if isinstance(own, AnalyticTwin) and plant.structure()[-1] != own.structure()[-1]:
             twin = stepping_by(twin, own.integrator)
-        return twin.at_interval(self.believed.dt, self._substeps)
+        return twin.at_interval(self.nominal.dt, self._substeps)
 
     @property
     def _substeps(self) -> int:
         """Of the extended twin: its own, or as short ones as dry friction needs."""
-        own, simulated = self.believed, self.hypotheses.believed
+        own, simulated = self.nominal, self.hypotheses.nominal
         if not self.screened or simulated.substeps <= self.given.least_substeps:
             return own.substeps
         inner = simulated.dt / simulated.substeps
@@ -293,7 +293,7 @@ class Inquiry:
         ]
 
     def _finer(self) -> list[str]:
-        more, own = self._substeps, self.believed.substeps
+        more, own = self._substeps, self.nominal.substeps
         if more == own:
             return []
         return [
@@ -313,11 +313,11 @@ class Inquiry:
         )
 
     def _far_off(self, base: Base) -> str:
-        """:return: a sentence on how far held-out windows are from what is believed, if they are"""
+        """:return: a sentence on how far held-out windows are from the model, if they are"""
         residual = self.search.confirm.evidence.fit(
             base.point.theta, (), base.held_out.offsets
         ).residual
-        found = distances(self.believed.channels, residual, self.given.sensor_noise, self.given.std)
+        found = distances(self.nominal.channels, residual, self.given.sensor_noise, self.given.std)
         return far_in_words(found)
 
     def _result(
@@ -342,7 +342,7 @@ class Inquiry:
         gain = by_horizon(confirm, start.held_out, base.held_out, self.given.thinning)
         return Diagnosis(
             verdict=verdict_of(findings, unexplained),
-            believed=self.believed,
+            believed=self.nominal,
             findings=findings,
             unexplained=unexplained,
             gain=gain,

@@ -44,7 +44,7 @@ def assemble(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equ
     :param quick: only the forces of ``CLOSED_FORMS``, which need no compilation, with the mass
         matrix as effective inertia
     """
-    twin, rows = hypotheses.believed, _rows(motion)
+    twin, rows = hypotheses.nominal, _rows(motion)
     given = (twin, twin.params, rows.q, rows.v, rows.actions)
     found = terms(*given)
     inertia = found.mass if quick else effective_inertia(*given, found)
@@ -189,7 +189,7 @@ def normal_problem(hypotheses: Hypotheses, equation: Equation) -> Problem:
         rests=_rests(equation, items),
         least=_least_late(equation, items),
         always=tuple(always),
-        rarity=tuple(rarity_of(item.candidate, hypotheses.believed) for item in items),
+        rarity=tuple(rarity_of(item.candidate, hypotheses.nominal) for item in items),
     )
 
 
@@ -223,7 +223,7 @@ def _bounds(h: Hypotheses, item: Item, name: str) -> tuple[float, float]:
     if item.candidate.slot == PARAMETER:
         place = item.candidate.place
         i = h.names.index(place)
-        value = h.believed.values[place]
+        value = h.nominal.values[place]
         return h.lower[i] - value, h.upper[i] - value
     full = next(p for p in item.candidate.parameters if p.rpartition(".")[2] == name)
     i = h.names.index(full)

@@ -142,7 +142,7 @@ class Screened(NamedTuple):
     def _by_full_name(self, candidate: Candidate, sizes: Mapping[str, float]) -> dict[str, float]:
         if candidate.slot == PARAMETER:
             (name,) = sizes
-            return {name: self.hypotheses.believed.values[name] + sizes[name]}
+            return {name: self.hypotheses.nominal.values[name] + sizes[name]}
         return {candidate.full_names[short]: float(value) for short, value in sizes.items()}
 
     @property
@@ -287,7 +287,7 @@ def _singles(p: Problem) -> set[str]:
 def _without_column(h: Hypotheses, p: Problem, moved: Motion, where: Sequence[str]) -> set[str]:
     """Keys of candidates without a column, unless the kinematics refute them."""
     there = {item.key for item in p.items}
-    refuted = refuted_by_kinematics(h.believed, moved)
+    refuted = refuted_by_kinematics(h.nominal, moved)
     found = set()
     for candidate in h.candidates:
         if candidate.slot == "joint":

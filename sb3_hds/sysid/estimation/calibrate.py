@@ -132,7 +132,7 @@ def fit_windows(
     *,
     threshold: float = HUBER,
     prior: float = 0.0,
-    believed: Float[np.ndarray, " p"] | None = None,
+    prior_mean: Float[np.ndarray, " p"] | None = None,
     level: float = 0.95,
     max_steps: int = 100,
     elsewhere: Callable[[], Forces | None] | None = None,
@@ -145,7 +145,7 @@ def fit_windows(
     :param origin: recording of each window, shape ``(n,)``
     :param deviations: standard deviation of each channel over the data
     :param threshold: of the Huber loss, in units of the noise
-    :param believed: centre of the prior; default: the twin's own values
+    :param prior_mean: centre of the prior; default: the twin's own values
     :param elsewhere: computes another start of the search, used if the errors of simulations with
         the twin's own values exceed a channel's standard deviation
     :raises CalibrationError: for fewer measurements than unknowns
@@ -161,7 +161,7 @@ def fit_windows(
         )
     kept, origin = shots.rows(real), origin[real]
     evidence = Evidence(
-        Hypotheses.of_values(twin, free, believed, prior),
+        Hypotheses.of_values(twin, free, prior_mean, prior),
         kept,
         _FIRST_NOISE * deviations,
         width=len(free),

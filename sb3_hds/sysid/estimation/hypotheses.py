@@ -37,7 +37,7 @@ class Hypotheses:
     """
     A twin with every candidate attached, all at the values at which they have no effect.
 
-    :param believed: nominal model
+    :param nominal: model without any cause
     :param twin: extended by all effects
     :param candidates: causes that may be named
     :param names: all parameters that may be fitted, nuisances first
@@ -55,7 +55,7 @@ class Hypotheses:
     :param starts: for candidates by key, values by full name at which a search may begin
     """
 
-    believed: Twin
+    nominal: Twin
     twin: Twin
     candidates: tuple[Candidate, ...]
     names: tuple[str, ...]
@@ -151,7 +151,7 @@ class Hypotheses:
             own = twin.parameters[name], twin.values[name]
             prior[i], lower[i], upper[i] = prior_of(name, *own, belief)
         return cls(
-            believed=twin,
+            nominal=twin,
             twin=extended,
             candidates=tuple(candidates),
             names=moving,
@@ -172,7 +172,7 @@ class Hypotheses:
         cls,
         twin: Twin,
         free: Free,
-        believed: Float[np.ndarray, " p"] | None = None,
+        prior_mean: Float[np.ndarray, " p"] | None = None,
         prior: float = 0.0,
     ) -> "Hypotheses":
         """
@@ -180,7 +180,7 @@ class Hypotheses:
 
         :param twin: as it is
         :param free: parameters, by the name of the value that they take
-        :param believed: centre of the prior; default: the twin's own values
+        :param prior_mean: centre of the prior; default: the twin's own values
         :param prior: how firm it is, as the reciprocal of its standard deviation in units of each
             parameter's scale; 0: there is none
         """
@@ -189,11 +189,11 @@ class Hypotheses:
         scale = np.array([p.scale for p in own], float)
         values = np.array([twin.values[name] for name in first], float)
         return cls(
-            believed=twin,
+            nominal=twin,
             twin=twin,
             candidates=(),
             names=tuple(free),
-            null=values if believed is None else np.asarray(believed, float),
+            null=values if prior_mean is None else np.asarray(prior_mean, float),
             scale=scale,
             lower=np.array([p.lower for p in own], float),
             upper=np.array([p.upper for p in own], float),
@@ -251,7 +251,7 @@ class Hypotheses:
     @cached_property
     def always(self) -> float:
         """:return: after how long the memory of the nominal model is forgotten [s]"""
-        return remembered_for(self.believed, self.period)
+        return remembered_for(self.nominal, self.period)
 
     def effect_of(self, candidate: Candidate) -> Effect | None:
         """:return: the effect that the candidate is; None for a parameter, or several effects"""
@@ -284,10 +284,10 @@ class Hypotheses:
 
     def added_to(self, name: str) -> float:
         """:return: what the nominal model already has of an effect's parameter"""
-        target = native_targets(self.believed, self.candidates).get(name)
+        target = native_targets(self.nominal, self.candidates).get(name)
         if target is None or self.twin.parameters[name].null != 0.0:
             return 0.0
-        return self.believed.values[target]
+        return self.nominal.values[target]
 
     def scaled(self, scales: Mapping[str, float]) -> "Hypotheses":
         """:return: the same with these typical deviations, by full name"""
@@ -309,15 +309,15 @@ class Hypotheses:
                 value[single] = value.get(single, null) + value[tie] - null
         singles = [single for name in names for single in self.ties.get(name, (name,))]
         own = {self.names[i]: value[self.names[i]] for i in self.nuisances}
-        native = native_targets(self.believed, chosen)
+        native = native_targets(self.nominal, chosen)
         for name in names:
             if name in native:
                 own[native[name]] = with_native(
-                    self.believed.values[native[name]], value[name], self.twin.parameters[name]
+                    self.nominal.values[native[name]], value[name], self.twin.parameters[name]
                 )
-            elif name in self.believed.parameters:
+            elif name in self.nominal.parameters:
                 own[name] = value[name]
-        there = {a.key for a in attached_of(self.believed)}
+        there = {a.key for a in attached_of(self.nominal)}
         wanted = {name.rpartition(".")[0] for name in singles}
         new = [
             a.effect.with_values(**{n: value[f"{a.key}.{n}"] for n in a.effect.parameters})
@@ -326,7 +326,7 @@ class Hypotheses:
             and a.key not in there
             and not any(f"{a.key}.{n}" in native for n in a.effect.parameters)
         ]
-        twin = self.believed.with_parameters(**own) if own else self.believed
+        twin = self.nominal.with_parameters(**own) if own else self.nominal
         return twin.extend(*new) if new else twin
 
     def place_of(self, candidate: Candidate) -> dict[str, str | int]:

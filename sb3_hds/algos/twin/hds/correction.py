@@ -284,7 +284,7 @@ def _calibrated(
             windows.origin,
             windows.std,
             prior=1.0,
-            believed=prior_values,
+            prior_mean=prior_values,
             max_steps=_SOLVER_STEPS,
         )
     except CalibrationError:
