@@ -92,16 +92,16 @@ def by_parameters(search, h, start) -> Answer:
 
 def by_regression(inquiry, start) -> Answer:
     """Sequentially thresholded least squares (SINDy) on the residual force."""
-    from sb3_hds.sysid.comparison.unexplained import missing_force, short_windows, weighed
+    from sb3_hds.sysid.comparison.unexplained import residual_forces, short_windows, weighed
 
     select = inquiry.search.select.evidence
     wide = inquiry.given.period, 2 * inquiry.given.most_windows
     short = short_windows(select, start.point.theta, inquiry.given.data, *wide)
-    missing = missing_force(short, inquiry.given.data)
+    residual = residual_forces(short, inquiry.given.data)
     twin, found = inquiry.hypotheses.twin, []
-    weights = weighed(missing._replace(force=np.ones_like(missing.force)))
+    weights = weighed(residual._replace(force=np.ones_like(residual.force)))
     for j, joint in enumerate(twin.joints):
-        q, v = missing.position[:, j], missing.velocity[:, j]
+        q, v = residual.position[:, j], residual.velocity[:, j]
         columns = {
             f"viscous_friction.{joint.name}": v,
             f"coulomb_friction.{joint.name}": np.sign(v),
@@ -111,8 +111,8 @@ def by_regression(inquiry, start) -> Answer:
             f"constant_force.{joint.name}": np.ones_like(q),
         }
         for k, actuator in enumerate(twin.actuators):
-            columns[f"torque_gain.{actuator.name}"] = missing.command[:, k]
-        force = weighed(missing)[:, j]
+            columns[f"torque_gain.{actuator.name}"] = residual.command[:, k]
+        force = weighed(residual)[:, j]
         matrix = np.stack(list(columns.values()), 1) * weights[:, j, None]
         moved = _sparse(matrix, force)
         best = int(np.argmax(np.abs(moved)))
@@ -153,18 +153,19 @@ def by_network(inquiry, start) -> Answer:
     import torch
 
     from sb3_hds.sysid.comparison.held_out import split
-    from sb3_hds.sysid.comparison.unexplained import missing_force, short_windows, weighed
+    from sb3_hds.sysid.comparison.unexplained import residual_forces, short_windows, weighed
 
     select = inquiry.search.select.evidence
     wide = inquiry.given.period, 2 * inquiry.given.most_windows
     short = short_windows(select, start.point.theta, inquiry.given.data, *wide)
-    missing = missing_force(short, inquiry.given.data)
+    residual = residual_forces(short, inquiry.given.data)
     inputs = np.concatenate(
-        [np.cos(missing.position), np.sin(missing.position), missing.velocity, missing.command], 1
+        [np.cos(residual.position), np.sin(residual.position), residual.velocity, residual.command],
+        1,
     )
     inputs = (inputs - inputs.mean(0)) / (inputs.std(0) + 1e-9)
-    held_out = split(inquiry.given.data, missing.origin, inquiry.seed).held_out
-    x, y = (torch.tensor(a, dtype=torch.float32) for a in (inputs, weighed(missing)))
+    held_out = split(inquiry.given.data, residual.origin, inquiry.seed).held_out
+    x, y = (torch.tensor(a, dtype=torch.float32) for a in (inputs, weighed(residual)))
     torch.manual_seed(0)
     net = torch.nn.Sequential(
         torch.nn.Linear(x.shape[1], _HIDDEN), torch.nn.Tanh(), torch.nn.Linear(_HIDDEN, y.shape[1])

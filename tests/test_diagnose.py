@@ -15,7 +15,7 @@ from sb3_hds.sysid.comparison.held_out import Comparison, split, t_or_rank_test,
 from sb3_hds.sysid.comparison.inference import standard_errors, systematic
 from sb3_hds.sysid.comparison.parameter_stability import Change
 from sb3_hds.sysid.comparison.starts import newton
-from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
+from sb3_hds.sysid.comparison.unexplained import ResidualForce, predictable_force
 from sb3_hds.sysid.diagnosis import residuals
 from sb3_hds.sysid.diagnosis.findings import (
     NAMELESS,
@@ -398,7 +398,7 @@ def test_friction_that_changes_with_place_or_time_is_left_over(where, seed):
     velocity, position = rng.standard_normal((2, n, 1))
     time = np.tile(np.arange(20.0), 10)
     factor = np.cos(2.0 * position) if where == "position" else time[:, None] / 10.0 - 1.0
-    missing = MissingForce(
+    residual = ResidualForce(
         force=np.sign(velocity) * factor + rng.standard_normal((n, 1)),
         stderr=np.ones((n, 1)),
         position=position,
@@ -411,7 +411,7 @@ def test_friction_that_changes_with_place_or_time_is_left_over(where, seed):
     )
     data = Trajectories.from_arrays([np.zeros((21, 1))] * 10, [np.zeros((20, 1))] * 10, dt=0.1)
 
-    found = remainder(missing, data, (Joint("hinge"),), seed=0)
+    found = predictable_force(residual, data, (Joint("hinge"),), seed=0)
 
     assert found is not None and {"velocity", where} <= set(found.goes_with)
 
@@ -425,7 +425,7 @@ def test_a_size_may_change_less_with_time_than_with_speed(goes_with, share, stea
         _gone=lambda *_: 1.0 - share,
     )
     one = SimpleNamespace(tried=SimpleNamespace(candidate=None))
-    left = SimpleNamespace(short=None, missing=None)
+    left = SimpleNamespace(short=None, residual=None)
 
     found = residuals.Residuals._varies(asking, one, SimpleNamespace(free=()), left)
 

@@ -19,7 +19,7 @@ from independent_rigs import SYSTEMS, Planted, System, simulate
 
 from sb3_hds import Trajectories, diagnose, effects, twins
 from sb3_hds.core import Channel, Joint
-from sb3_hds.sysid.comparison.unexplained import MissingForce, remainder
+from sb3_hds.sysid.comparison.unexplained import ResidualForce, predictable_force
 from sb3_hds.sysid.equation.screening import screen
 from sb3_hds.sysid.motion.motion import smoothed_motion
 from sb3_hds.twins.rigs.linear_axis import LinearAxis
@@ -340,7 +340,7 @@ def test_a_residual_force_is_as_predictable_whatever_the_unit_of_length(length):
     force = 3.0 * np.sin(5.0 * position) + rng.standard_normal((n, 1))
 
     def left(unit):
-        missing = MissingForce(
+        residual = ResidualForce(
             force=force,
             stderr=np.ones((n, 1)),
             position=unit * position,
@@ -351,7 +351,7 @@ def test_a_residual_force_is_as_predictable_whatever_the_unit_of_length(length):
             numbers=10,
             noise=np.ones(1),
         )
-        return remainder(missing, data, (Joint("axis", "m"),), seed=0)
+        return predictable_force(residual, data, (Joint("axis", "m"),), seed=0)
 
     plain, other = left(1.0), left(length)
 

@@ -6,7 +6,12 @@ import pytest
 from sb3_hds.core import Joint, Trajectories
 from sb3_hds.sysid.comparison import unexplained
 from sb3_hds.sysid.comparison.held_out import Split
-from sb3_hds.sysid.comparison.unexplained import MissingForce, _by_chance, _predicted, remainder
+from sb3_hds.sysid.comparison.unexplained import (
+    ResidualForce,
+    _by_chance,
+    _predicted,
+    predictable_force,
+)
 
 N_SETS, N_UNITS = 11, 8
 
@@ -84,7 +89,7 @@ def test_the_force_of_one_of_two_joints_in_few_recordings_is_left_over():
     position, velocity = rng.standard_normal((2, n, 2))
     origin, forces = np.repeat(np.arange(N_UNITS), 20), rng.standard_normal((n, 2))
     forces[:, 0] += 3.0 * np.sign(position[:, 0]) * (origin < 3)
-    missing = MissingForce(
+    residual = ResidualForce(
         force=forces,
         stderr=np.ones((n, 2)),
         position=position,
@@ -97,6 +102,6 @@ def test_the_force_of_one_of_two_joints_in_few_recordings_is_left_over():
     )
     data = Trajectories.from_arrays(np.zeros((N_UNITS, 21, 1)), np.zeros((N_UNITS, 20, 1)), dt=0.1)
 
-    found = remainder(missing, data, [Joint("hip"), Joint("knee")], seed=0)
+    found = predictable_force(residual, data, [Joint("hip"), Joint("knee")], seed=0)
 
     assert found is not None and (found.joint, found.goes_with) == ("hip", ("position",))

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from sb3_hds.sysid.comparison.held_out import STRICTER
 from sb3_hds.sysid.comparison.inference import RANK
-from sb3_hds.sysid.comparison.unexplained import MissingForce, ShortWindows
+from sb3_hds.sysid.comparison.unexplained import ResidualForce, ShortWindows
 
 # Waves over the ranks of a quantity with which a size may change, and the level at which it does.
 _WAVES, _LEVEL = 4, 0.01
@@ -30,7 +30,7 @@ class Change(NamedTuple):
 
 
 def change(
-    short: ShortWindows, missing: MissingForce, own: Sequence[int], free: Sequence[int]
+    short: ShortWindows, residual: ResidualForce, own: Sequence[int], free: Sequence[int]
 ) -> Change | None:
     r"""
     A score test. Let a parameter :math:`\theta_i` become :math:`\theta_i + \sum_k c_k b_k(z)` with
@@ -45,13 +45,13 @@ def change(
     1992; Zeileis and Hornik, *Generalized M-fluctuation tests for parameter instability*,
     Statistica Neerlandica 61(4), 2007 (scores ordered by any quantity).
 
-    :param missing: of the same windows
+    :param residual: of the same windows
     :param own: indices of the parameters of the cause
     :param free: indices of all that was fitted, these among them
     :return: the quantity on which it depends most; None if the parameters are constant
     """
     slopes = short.evidence.slopes(short.point, free)
-    quantities = list(_quantities(missing))
+    quantities = list(_quantities(residual))
     n_tests, found = len(own) * len(quantities), []
     for parameter in (list(free).index(i) for i in own):
         for name, values in quantities:
@@ -106,14 +106,14 @@ def _tested(
     return _Tested(p_value, 0.5 * real * gained)
 
 
-def _quantities(missing: MissingForce) -> Iterator[tuple[str, np.ndarray]]:
-    for joint in range(missing.position.shape[1]):
-        yield "position", missing.position[:, joint]
-        yield "velocity", missing.velocity[:, joint]
-        yield "speed", np.abs(missing.velocity[:, joint])
-    for actuator in range(missing.command.shape[1]):
-        yield "command", missing.command[:, actuator]
-    yield "time", missing.time
+def _quantities(residual: ResidualForce) -> Iterator[tuple[str, np.ndarray]]:
+    for joint in range(residual.position.shape[1]):
+        yield "position", residual.position[:, joint]
+        yield "velocity", residual.velocity[:, joint]
+        yield "speed", np.abs(residual.velocity[:, joint])
+    for actuator in range(residual.command.shape[1]):
+        yield "command", residual.command[:, actuator]
+    yield "time", residual.time
 
 
 def _waves(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:

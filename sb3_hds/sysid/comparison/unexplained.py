@@ -13,7 +13,7 @@ from sb3_hds.sysid.estimation.evidence import Evidence, Point, Slopes
 from sb3_hds.sysid.estimation.shooting import Shots, evenly, shots_of
 from sb3_hds.sysid.motion.joints import motion_of
 
-# Length of a window over which the missing force counts as constant, in periods of the motion, and
+# Length of a window over which the residual force counts as constant, in periods of the motion, and
 # in steps.
 _WINDOW, _SHORTEST, _LONGEST = 0.2, 4, 25
 # Steps of the fit of their start states.
@@ -35,7 +35,7 @@ _CONSTANT = 1e-9
 
 class ShortWindows(NamedTuple):
     """
-    Windows over which a missing force counts as constant, start states fitted.
+    Windows over which a residual force counts as constant, start states fitted.
 
     :param evidence: of windows that are lengthened to those of its program
     :param point: the current model, on them
@@ -51,7 +51,7 @@ class ShortWindows(NamedTuple):
     time: np.ndarray
 
 
-class MissingForce(NamedTuple):
+class ResidualForce(NamedTuple):
     """
     Residual force of each window: the constant generalised force that the model lacks there.
 
@@ -79,7 +79,7 @@ class MissingForce(NamedTuple):
     noise: np.ndarray
 
 
-class Remainder(NamedTuple):
+class PredictableForce(NamedTuple):
     """
     :param joint: joint with the largest predictable share
     :param goes_with: quantities that it depends on
@@ -134,7 +134,7 @@ def short_windows(
     return ShortWindows(short, short.fit(theta, (), n_steps=_STEPS), shots, origin, time[some])
 
 
-def missing_force(short: ShortWindows, data: Trajectories) -> MissingForce:
+def residual_forces(short: ShortWindows, data: Trajectories) -> ResidualForce:
     """:param data: measured"""
     evidence, point, shots, origin, time = short
     h, steps = evidence.hypotheses, shots.actions.shape[1]
@@ -145,7 +145,7 @@ def missing_force(short: ShortWindows, data: Trajectories) -> MissingForce:
     rest = _left_by_forces(short, slopes)
     calmer = np.sqrt(np.median(rest) / max(numbers - point.offsets.shape[1] - len(scale), 1))
     q, v = motion_of(h.nominal, shots.obs, data.dt)
-    return MissingForce(
+    return ResidualForce(
         force=-scale * slopes.scores / informed,
         stderr=calmer * scale / np.sqrt(informed),
         position=np.unwrap(q, axis=1).mean(1),
@@ -181,13 +181,13 @@ def _lengthened(shots: Shots, steps: int) -> Shots:
     return shots._replace(obs=filled(shots.obs, steps + 1), actions=filled(shots.actions, steps))
 
 
-def remainder(
-    missing: MissingForce,
+def predictable_force(
+    residual: ResidualForce,
     data: Trajectories,
     joints: Sequence[Joint],
     seed: int,
     least_power: float = 0.0,
-) -> Remainder | None:
+) -> PredictableForce | None:
     """
     Whether a smooth function of position, velocity, command and time, learned on one half of the
     recordings, predicts the residual force of the other half, and the other way round
@@ -196,17 +196,19 @@ def remainder(
     :param least_power: of what is predicted, below which it is too small to matter
     :return: joint and quantities; None if nothing can be predicted
     """
-    parts = split(data, missing.origin, seed)
-    quantities = _quantities(missing, joints)
+    parts = split(data, residual.origin, seed)
+    quantities = _quantities(residual, joints)
     sets = [names for k in (1, 2, len(quantities)) for names in combinations(quantities, k)]
-    forces = [np.clip(f, -_MOST_RATIO * f.std(), _MOST_RATIO * f.std()) for f in weighed(missing).T]
+    forces = [
+        np.clip(f, -_MOST_RATIO * f.std(), _MOST_RATIO * f.std()) for f in weighed(residual).T
+    ]
     told = [
         {names: _predicted(_together(quantities, names), force, parts) for names in sets}
         for force in forces
     ]
     agreement = np.array([[one.agreement for one in by_names.values()] for by_names in told])
     p_values = _by_chance(agreement, parts.cluster)
-    found: list[Remainder] = []
+    found: list[PredictableForce] = []
     for joint, force, by_names, p_of_joint in zip(joints, forces, told, p_values, strict=True):
         p_value = dict(zip(by_names, map(float, p_of_joint), strict=True))
         best = max(by_names, key=lambda names: by_names[names].gain)
@@ -218,29 +220,31 @@ def remainder(
         power = gain * max(float(np.mean(force**2)), 1.0)
         if power < least_power:
             continue
-        found.append(Remainder(joint.name, enough, gain, p_value[enough], power))
+        found.append(PredictableForce(joint.name, enough, gain, p_value[enough], power))
     return max(found, key=lambda r: r.gain, default=None)
 
 
-def weighed(missing: MissingForce) -> Float[np.ndarray, "n dof"]:
+def weighed(residual: ResidualForce) -> Float[np.ndarray, "n dof"]:
     """
     :return: forces in units of their standard errors, with less weight for windows that determine
         them poorly
     """
-    typical = np.median(missing.stderr, 0)
-    return missing.force / missing.stderr * np.minimum(1.0, typical / missing.stderr)
+    typical = np.median(residual.stderr, 0)
+    return residual.force / residual.stderr * np.minimum(1.0, typical / residual.stderr)
 
 
-def _quantities(missing: MissingForce, joints: Sequence[Joint]) -> dict[str, np.ndarray]:
+def _quantities(residual: ResidualForce, joints: Sequence[Joint]) -> dict[str, np.ndarray]:
     """:return: what a residual force may depend on, by name, each of shape ``(n, k)``"""
     hinges = np.array([joint.unit == "rad" for joint in joints])
     # A sine of metres would depend on their unit.
-    angle = np.where(hinges, missing.position, _scaled(missing.position))
+    angle = np.where(hinges, residual.position, _scaled(residual.position))
     quantities = {
-        "position": np.concatenate([np.cos(angle), np.sin(angle), missing.position], 1),
-        "velocity": np.concatenate([missing.velocity, np.tanh(3.0 * _scaled(missing.velocity))], 1),
-        "command": missing.command,
-        "time": missing.time[:, None],
+        "position": np.concatenate([np.cos(angle), np.sin(angle), residual.position], 1),
+        "velocity": np.concatenate(
+            [residual.velocity, np.tanh(3.0 * _scaled(residual.velocity))], 1
+        ),
+        "command": residual.command,
+        "time": residual.time[:, None],
     }
     return {name: values for name, values in quantities.items() if values.shape[1]}
 

@@ -16,7 +16,7 @@ from sb3_hds.sysid.comparison.inference import (
     widened,
 )
 from sb3_hds.sysid.comparison.parameter_stability import Change
-from sb3_hds.sysid.comparison.unexplained import Remainder
+from sb3_hds.sysid.comparison.unexplained import PredictableForce
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
@@ -219,7 +219,7 @@ def bounds_in_words(ends: Sequence[tuple[str, float, float, str]]) -> str:
     )
 
 
-def in_words(left: Remainder) -> str:
+def in_words(left: PredictableForce) -> str:
     share = f"{left.gain:.0%}"
     return (
         f"A force at {left.joint} goes with {' and '.join(left.goes_with)}; {share} of its "

@@ -119,7 +119,7 @@ class Inquiry:
         nearest = ""
         if found:
             found, base, left, nearest = self.residuals.constant(found, base)
-        if len(found) == 1 and left.remainder is not None and self.screened is None:
+        if len(found) == 1 and left.predictable is not None and self.screened is None:
             pair = naming.pair(found[0], base, firsts) or naming.without_reranking(firsts)
             if pair is not None and (rest := self.residuals.left_by(*pair)) is not None:
                 found, base, left = *pair, rest
@@ -127,7 +127,7 @@ class Inquiry:
         found, base, force = naming.replaced_by_forces(found, base)
         if force is not None:
             left = self.residuals.left(base)
-        elif not found or left.remainder is not None:
+        elif not found or left.predictable is not None:
             force = naming.nameless(base, keys_of(found))
         if force is not None:
             words = nameless_in_words(*force, self.hypotheses)
@@ -136,15 +136,15 @@ class Inquiry:
         if found and self.residuals.explained(found, start, base, before, left) < LEAST_SHARE:
             # Something is there, and this is not it.
             found, base = [], start
-            left = before if before.remainder is not None else left
+            left = before if before.predictable is not None else left
         rejected = [pair for pair in rejected if pair[0].key not in keys_of(found)]
-        if not (found or nearest) and left.remainder is None:
+        if not (found or nearest) and left.predictable is None:
             nearest = contradiction(rejected)
         self._set_noise(base.point)
         start, base = map(self.search.refit, (start, base))
         if at_bounds := self._at_bounds(base):
             found, base, left, nearest = [], start, before, at_bounds
-        elif not (found or nearest) and left.remainder is None:
+        elif not (found or nearest) and left.predictable is None:
             nearest = self._far_off(base)
         return self._result(found, rejected, start, base, before, left, nearest)
 
@@ -337,7 +337,7 @@ class Inquiry:
             finding(one, whole, point, base.free, self.effort.profiles)
             for one in self._beside_the_equation(found)
         )
-        remains = "" if left.remainder is None else in_words(left.remainder)
+        remains = "" if left.predictable is None else in_words(left.predictable)
         unexplained = " ".join(filter(None, (nearest, remains)))
         gain = by_horizon(confirm, start.held_out, base.held_out, self.given.thinning)
         return Diagnosis(
@@ -373,8 +373,8 @@ class Inquiry:
                 start.held_out,
                 base.held_out,
                 self.given.thinning,
-                before.missing,
-                left.missing,
+                before.residual,
+                left.residual,
                 self.screened.friction_curves(keys_of(found)) if self.screened else (),
             ),
             opened=partial(

@@ -9,11 +9,11 @@ from sb3_hds.sysid.comparison.halves import Accepted, Base
 from sb3_hds.sysid.comparison.parameter_stability import Change, change
 from sb3_hds.sysid.comparison.search import Search
 from sb3_hds.sysid.comparison.unexplained import (
-    MissingForce,
-    Remainder,
+    PredictableForce,
+    ResidualForce,
     ShortWindows,
-    missing_force,
-    remainder,
+    predictable_force,
+    residual_forces,
     short_windows,
     weighed,
 )
@@ -25,7 +25,7 @@ LEAST_SHARE = 0.9
 # The same of a cause and of how its size changes with time: a force whose form is a little wrong
 # seems to change with position or speed, but not with time.
 _LEAST_SHARE_IN_TIME = 0.95
-# A force that moves a short window by a smaller share of what is irrelevant is no remainder.
+# A force that moves a short window by a smaller share of what is irrelevant does not matter.
 _OF_IRRELEVANT = 0.18
 
 
@@ -33,18 +33,18 @@ class Left(NamedTuple):
     """
     What a model leaves unexplained.
 
-    :param remainder: the part that can be predicted
+    :param predictable: the part that can be predicted
     :param predicted: mean square of that part, in units of the force's standard error under the
         noise of the search
     :param power: mean square of the whole residual force, likewise
-    :param missing: all of it
+    :param residual: all of it
     :param short: the short windows in which it was estimated
     """
 
-    remainder: Remainder | None
+    predictable: PredictableForce | None
     predicted: float
     power: float
-    missing: MissingForce
+    residual: ResidualForce
     short: ShortWindows
 
 
@@ -64,15 +64,17 @@ class Residuals:
     def left(self, base: Base) -> Left:
         """:return: what the current model leaves"""
         short = self._short(base.point.theta)
-        missing = missing_force(short, self.given.data)
-        power = float(np.mean(np.sum(weighed(missing) ** 2, 1)))
-        mind = float(np.mean((IRRELEVANT * self.given.std / missing.noise) ** 2))
-        least = _OF_IRRELEVANT**2 * mind * missing.numbers
-        found = remainder(missing, self.given.data, self.hypotheses.twin.joints, self.seed, least)
+        residual = residual_forces(short, self.given.data)
+        power = float(np.mean(np.sum(weighed(residual) ** 2, 1)))
+        mind = float(np.mean((IRRELEVANT * self.given.std / residual.noise) ** 2))
+        least = _OF_IRRELEVANT**2 * mind * residual.numbers
+        found = predictable_force(
+            residual, self.given.data, self.hypotheses.twin.joints, self.seed, least
+        )
         # Errors of forces are known better the less is missing: two twins need one unit.
-        unit = float(np.mean((missing.noise / self.search.noise) ** 2))
+        unit = float(np.mean((residual.noise / self.search.noise) ** 2))
         predicted = 0.0 if found is None else unit * found.power
-        return Left(found, predicted, unit * power, missing, short)
+        return Left(found, predicted, unit * power, residual, short)
 
     def constant(self, found: list[Accepted], base: Base) -> tuple[list[Accepted], Base, Left, str]:
         """
@@ -114,7 +116,7 @@ class Residuals:
         """
         share = _share(before, left)
         if any(self.hypotheses.remembers(one.tried.candidate) for one in found):
-            half, noise = self.search.confirm, left.missing.noise / self.search.noise
+            half, noise = self.search.confirm, left.residual.noise / self.search.noise
             floor = float(np.mean(noise**2)) * half.evidence.shots.n
             wrong, rest = (half.total(point) - floor for point in (start.held_out, base.held_out))
             share = max(share, 1.0 - rest / wrong if 0.0 < rest < wrong else float(rest <= 0.0))
@@ -126,7 +128,7 @@ class Residuals:
         if self.hypotheses.remembers(candidate):
             return None
         own = self.hypotheses.indices(candidate)
-        changes = change(left.short, left.missing, own, base.free)
+        changes = change(left.short, left.residual, own, base.free)
         if changes is None:
             return None
         gone = max(self._gone(one, base, left), 0.0)
@@ -147,6 +149,6 @@ class Residuals:
 
 
 def _share(before: Left, left: Left) -> float:
-    """:return: of the missing force that can be predicted, how much is not missing any more"""
+    """:return: of the residual force that can be predicted, how much is explained"""
     gone = max(before.power - left.power, 0.0)
     return gone / (gone + left.predicted) if gone + left.predicted else 1.0

@@ -55,7 +55,7 @@ def assemble(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equ
         terms=found,
         effective_inertia=inertia,
         load=np.einsum("nij,nj->ni", found.mass, rows.a) + found.bias,
-        missing=residual_force(inertia, rows.measured - found.change, motion.dt),
+        residual=residual_force(inertia, rows.measured - found.change, motion.dt),
         smooth=residual_force(inertia, rows.change - found.change, motion.dt),
     )
     refuted = set() if quick else refuted_by_kinematics(twin, motion)
@@ -138,7 +138,7 @@ def _add_parameter(made: Equation, candidate: Candidate) -> None:
     slope = (there.mass - now.mass) / step
     if np.abs(slope).max() > 0.0:
         made.slopes[candidate.key] = slope
-        made.noisy[index] = put(made, None, column_of(rows.measured, made.missing))
+        made.noisy[index] = put(made, None, column_of(rows.measured, made.residual))
     drive = np.sum((there.actuator - now.actuator) * now.actuator, axis=0) / step
     power = np.sum(now.actuator**2, axis=0)
     drive = np.divide(drive, power, out=np.zeros_like(drive), where=power > 0.0)
@@ -162,7 +162,7 @@ def normal_problem(hypotheses: Hypotheses, equation: Equation) -> Problem:
     for number in always:
         (column,), name = items[number].columns, items[number].candidate.place
         prior[column] = hypotheses.prior[hypotheses.names.index(name)] ** -2.0
-    dof = equation.missing.shape[1]
+    dof = equation.residual.shape[1]
     shares = np.zeros((dof, n))
     for c, column in enumerate(equation.columns):
         own = slice(None) if column.joint is None else column.joint

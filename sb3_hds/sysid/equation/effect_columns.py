@@ -231,7 +231,7 @@ def add_common(made: Equation, candidates: Sequence[Candidate]) -> None:
                 continue
             columns = []
             for same in zip(*(item.columns for item in items), strict=True):
-                total = np.zeros_like(made.missing)
+                total = np.zeros_like(made.residual)
                 for column in (made.columns[c] for c in same):
                     total[:, slice(None) if column.joint is None else column.joint] += column.values
                 columns.append(put(made, None, total))

@@ -202,7 +202,7 @@ class ByVelocity(NamedTuple):
     The equation of one joint, averaged over intervals of similar velocity.
 
     :param velocity: mean of each group, ascending, shape ``(groups,)``
-    :param forces: mean of what each column adds, and of the missing force, shape
+    :param forces: mean of what each column adds, and of the residual force, shape
         ``(groups, used + 1)``
     :param used: indices of the columns
     """
@@ -237,7 +237,7 @@ def by_velocity(equation: Equation, j: int) -> ByVelocity:
     begins = np.arange(n) * len(order) // n
     sizes = np.diff(begins, append=len(order))
     mean = lambda values: np.add.reduceat(values[order], begins) / sizes  # noqa: E731
-    forces = [mean(values) for values in (*acting.values(), equation.missing[:, j])]
+    forces = [mean(values) for values in (*acting.values(), equation.residual[:, j])]
     return ByVelocity(mean(equation.rows.v[:, j]), np.stack(forces, 1), np.array([*acting], int))
 
 

@@ -28,7 +28,7 @@ class Solution(NamedTuple):
     :param free: columns whose coefficients were estimated
     :param theta: coefficients
     :param inverse: of their normal matrix
-    :param weights: of all columns in the residual; the last is that of the missing force
+    :param weights: of all columns in the residual; the last is that of the residual force
     :param held: columns whose coefficients are at a bound
     :param gains: of columns that act on a command, its gain in this set
     """
@@ -161,7 +161,7 @@ class Equation:
     :param effective_inertia: over an interval, force over change of velocity with
         damping, shape ``(n, dof, dof)``
     :param load: force that the nominal model transmits: inertia, gravity, shape ``(n, dof)``
-    :param missing: residual force of the nominal model, shape ``(n, dof)`` [N m] or [N]
+    :param residual: residual force of the nominal model, shape ``(n, dof)`` [N m] or [N]
     :param smooth: the same with smoothed velocities
     :param columns: what candidates would add
     :param items: candidates, several with different settings
@@ -178,7 +178,7 @@ class Equation:
     terms: Terms
     effective_inertia: np.ndarray
     load: np.ndarray
-    missing: np.ndarray
+    residual: np.ndarray
     smooth: np.ndarray
     columns: list[Column] = dataclasses.field(default_factory=list)
     items: list[Item] = dataclasses.field(default_factory=list)

@@ -51,7 +51,7 @@ class Rows(NamedTuple):
     """
     The equation of one joint, in units of its noise.
 
-    :param y: missing force, shape ``(n,)``
+    :param y: residual force, shape ``(n,)``
     :param x: columns, shape ``(n, used)``
     :param used: indices of the columns
     :param block: of data that each row is from, shape ``(n,)``
@@ -90,7 +90,7 @@ def weak_rows(equation: Equation, j: int) -> Rows:
     acting = {i: values for i, c in enumerate(columns) if (values := c.at(j)) is not None}
     acting = {i: values for i, values in acting.items() if np.abs(values).max() > 0.0}
     used = np.array([*acting], int)
-    table = np.stack([equation.missing[:, j], *acting.values()], 1)
+    table = np.stack([equation.residual[:, j], *acting.values()], 1)
     rich = rich_columns(equation.items, used)
     period = motion.period[j] if np.isfinite(motion.period[j]) else 1.0
     widest = max(_WIDTH * period, _LEAST * motion.dt) / (2.0 * motion.dt)
@@ -221,7 +221,7 @@ class Grams(NamedTuple):
     """
     Normal equations, by joint and block of data: any set of columns is solved in a millisecond.
 
-    :param blocks: shape ``(blocks, columns + 1, columns + 1)``; the last row is the missing force
+    :param blocks: shape ``(blocks, columns + 1, columns + 1)``; the last row is the residual force
     :param by_joint: shape ``(dof, columns + 1, columns + 1)``
     :param folds: of held-out data, shape ``(folds, dof, columns + 1, columns + 1)``
     :param n_effective: number of independent rows of each joint
@@ -246,7 +246,7 @@ def grams(equation: Equation) -> Grams:
     Where blocks disagree more than independent rows would, each row counts as less than one, by the
     ratio of cluster-robust to naive variances of the rich model's coefficients.
     """
-    n_columns, dof = len(equation.columns), equation.missing.shape[1]
+    n_columns, dof = len(equation.columns), equation.residual.shape[1]
     pieces = max(1, -(-_BLOCKS // len(np.unique(equation.rows.recording))))
     n_blocks = (int(equation.rows.recording.max()) + 1) * pieces
     blocks = np.zeros((n_blocks, n_columns + 1, n_columns + 1))

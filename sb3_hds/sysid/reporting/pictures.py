@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sb3_hds.sysid.comparison.halves import NOT_FINITE, Half
-from sb3_hds.sysid.comparison.unexplained import MissingForce
+from sb3_hds.sysid.comparison.unexplained import ResidualForce
 from sb3_hds.sysid.equation.members import FrictionCurve
 from sb3_hds.sysid.estimation.evidence import Point
 
@@ -54,8 +54,8 @@ class Pictures(NamedTuple):
     replay: Replay
     steps: np.ndarray
     errors: np.ndarray
-    missing: MissingForce
-    left: MissingForce
+    missing: ResidualForce
+    left: ResidualForce
     friction: tuple[FrictionCurve, ...] = ()
 
 
@@ -106,8 +106,8 @@ def pictures_of(
     before: Point,
     after: Point,
     thinning: int,
-    missing: MissingForce,
-    left: MissingForce,
+    missing: ResidualForce,
+    left: ResidualForce,
     friction: tuple[FrictionCurve, ...],
 ) -> Pictures:
     """
