@@ -1,10 +1,13 @@
 """Every algorithm with small networks and budgets: the tests check that it works, not how well."""
 
+import contextlib
 import io
 import zipfile
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 import torch as th
@@ -86,6 +89,22 @@ def logged(model: BaseAlgorithm) -> Lines:
     lines = Lines()
     model.set_logger(Logger(folder=None, output_formats=[lines]))
     return lines
+
+
+@contextlib.contextmanager
+def compilations() -> Iterator[Counter[str]]:
+    """:return: how often each function is compiled in the block, by its name"""
+    counts, listening = Counter(), True
+
+    def count(event: str, _: float, fun_name: str = "", **__) -> None:
+        if listening and event.endswith("backend_compile_duration"):
+            counts[fun_name.removeprefix("jit(").removesuffix(")")] += 1
+
+    jax.monitoring.register_event_duration_secs_listener(count)
+    try:
+        yield counts
+    finally:
+        listening = False
 
 
 def same(first: dict, second: dict) -> bool:

@@ -12,7 +12,7 @@ import torch as th
 from cases import each
 from gymnasium import spaces
 from odd_envs import ACT, AnySpaces
-from small_models import STATES, greedy, logged, reloaded, same, small
+from small_models import STATES, compilations, greedy, logged, reloaded, same, small
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
@@ -46,6 +46,16 @@ def test_observations_and_actions_of_any_shape_are_learned_from(name, space):
 
     assert env.action_space.contains(model.predict(env.reset()[0])[0])
     assert model.replay_buffer.actions.shape[2:] == (4,)
+
+
+def test_a_call_of_train_compiles_one_program_for_all_but_the_last_of_its_updates():
+    # A width that no other test has; 64 updates at once, then 64 and 32.
+    model = small("droq", policy_kwargs={"net_arch": [7]}, learning_starts=20).learn(15)
+
+    with compilations() as counts:
+        model.train(160, 16)
+
+    assert model._n_updates == 160 and counts["update"] == 2
 
 
 def test_after_the_same_seed_a_model_explores_and_learns_alike():

@@ -4,14 +4,12 @@ import os
 import signal
 import threading
 import time
-from collections import Counter
 
 import gymnasium
-import jax
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
-from small_models import logged, reloaded, small
+from small_models import compilations, logged, reloaded, small
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -114,22 +112,13 @@ def test_an_interrupt_acts_while_programs_compile(monkeypatch):
 
 def test_no_program_is_compiled_twice():
     programs = ("fresh_networks", "init_workspace", "plan_ahead", "learn_policy", "learn_value")
-    counts, listening = Counter(), True
-
-    def count(event: str, _: float, fun_name: str = "", **__) -> None:
-        if listening and event.endswith("backend_compile_duration"):
-            counts[fun_name.removeprefix("jit(").removesuffix(")")] += 1
-
-    jax.monitoring.register_event_duration_secs_listener(count)
-    try:
+    with compilations() as counts:
         # Sizes that no other test has: nothing of it is compiled yet.
         own = {"horizon": 5, "policy_kwargs": {"net_arch": [5]}}
         # Policies are compared after the tenth epoch.
         model = small("hds", pretrain_epochs=10, **own).learn(25)
         # What is loaded has the types that it had when it was saved.
         reloaded(model).learn(50, reset_num_timesteps=False)
-    finally:
-        listening = False
 
     assert {name: counts[name] for name in (*programs, "mean_return")} == dict.fromkeys(
         (*programs, "mean_return"), 1

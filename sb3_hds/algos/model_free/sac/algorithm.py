@@ -159,7 +159,8 @@ class SoftActorCritic(ModelFreeAlgorithm):
             state, found = update(
                 policy.update_config, policy.agent_state, batches, now, hyper, found
             )
-            report = {name: float(x) for name, x in jax.device_get(found)._asdict().items()}
+            found = jax.device_get(found)  # NumPy, as before the first update: compiles once
+            report = {name: float(x) for name, x in found._asdict().items()}
             self._accept(state, report)
         return report
 
