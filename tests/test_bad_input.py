@@ -48,6 +48,11 @@ MISTAKES = {
     "a seed below 0": (PENDULUM, {"seed": -1}, "seed must be"),
     "a seed that is a word": (PENDULUM, {"seed": "zero"}, "seed must be None or a whole number"),
     "policy_kwargs as a word": (PENDULUM, {"policy_kwargs": "dict()"}, "must be a dictionary"),
+    "policy_kwargs as a list": (PENDULUM, {"policy_kwargs": []}, "policy_kwargs must be a dict"),
+    "policy_kwargs as a number": (PENDULUM, {"policy_kwargs": 0}, "policy_kwargs must be a dict"),
+    "a truth value as a number": (PENDULUM, {"batch_size": True}, "batch_size must be a whole"),
+    "no learning rate": (PENDULUM, {"learning_rate": None}, "learning_rate must be a finite"),
+    "a list of learning rates": (PENDULUM, {"learning_rate": [1e-3]}, "or a schedule"),
     "no such device": (PENDULUM, {"device": "cuda:7"}, "'cuda:7'.*it has: .*cpu"),
 }
 REFUSED = (ValueError, TypeError, AssertionError, gymnasium.error.NameNotFound)

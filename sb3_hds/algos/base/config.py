@@ -183,7 +183,7 @@ class Config:
 
     def _require_mapping(self, name: str) -> None:
         value = getattr(self, name)
-        if not isinstance(value or {}, Mapping):
+        if not (value is None or isinstance(value, Mapping)):
             raise TypeError(
                 self._objection(name, "a dictionary, such as {'net_arch': [64, 64]}, or None")
             )
@@ -240,7 +240,7 @@ class OffPolicyConfig(Config):
         :param name: of a learning rate
         """
         rate = getattr(self, name)
-        fine = not isinstance(rate, numbers.Real) or between(rate, 0.0, math.inf)
+        fine = callable(rate) or isinstance(rate, str) or between(rate, 0.0, math.inf)
         self.require(fine, name, "a finite number of at least 0, or a schedule")
         if isinstance(rate, str):
             schedule_of(rate)
@@ -261,7 +261,7 @@ def is_count(value: Any, least: int, may_be_none: bool = False) -> bool:
     """:return: whether it is a whole number of at least ``least``"""
     if value is None:
         return may_be_none
-    return isinstance(value, int | np.integer) and int(value) >= least
+    return is_whole(value) and int(value) >= least
 
 
 def check_count(name: str, value: Any, least: int = 1) -> None:
