@@ -294,7 +294,7 @@ class TwinAlgorithm(TensorAlgorithm):
             fresh = int(policy.progress.n_epochs) == 0
             if fresh:
                 seed = int(np.asarray(policy.progress.key)[0])
-                prepare_statistics(self._vec_normalize_env, program.twin, jax.random.key(seed))
+                prepare_statistics(self.get_vec_normalize_env(), program.twin, jax.random.key(seed))
             view, params = self._view(program.twin), program.twin.params
             started = partial(init_workspace, program, params, view, policy.progress)
             [(workspace, scales, progress)] = run_in_threads([started], self.poll)

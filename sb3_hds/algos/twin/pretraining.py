@@ -126,7 +126,7 @@ class OwnSeries(Logger):
 
 
 def no_poll() -> None:
-    """Do no_poll: the value of ``poll`` outside the pretraining."""
+    """Do nothing: the value of ``poll`` outside the pretraining."""
 
 
 def run_in_thread(work: Callable[[], Any]) -> Future[Any]:
