@@ -153,7 +153,9 @@ class TwinAlgorithm(TensorAlgorithm):
         if self._comparison and is_compared(n_epochs + 1, every, self.comparison_due):
             run_in_threads([self._comparison], self.poll)
             self._comparison = no_poll
-        state, returns = choose_policy(program, state, hyper, every, self.comparison_due)
+        state, returns = choose_policy(
+            program, state, hyper, every, self.comparison_due, self.was_compared
+        )
         losses = float(metrics.policy_loss), float(metrics.value_loss)
         if not (all(map(math.isfinite, losses)) and all_finite(state.networks)):
             raise DivergedError(
@@ -259,6 +261,12 @@ class TwinAlgorithm(TensorAlgorithm):
     def comparison_due(self) -> bool:
         """Whether policies are compared after this epoch regardless of ``compare_every``."""
         return False
+
+    @property
+    def was_compared(self) -> bool:
+        """Whether policies were compared after an earlier epoch."""
+        every = self.config.refinements.compare_every
+        return every > 0 and int(self.policy.progress.n_epochs) >= every
 
     def varied(self, twin: Twin) -> Params:
         """

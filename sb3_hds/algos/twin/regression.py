@@ -281,19 +281,25 @@ def _next_keys(state: EpochState) -> jax.Array:
 
 
 def choose_policy(
-    config: EpochConfig, state: EpochState, hyper: Hyperparams, every: int, due: bool
+    config: EpochConfig,
+    state: EpochState,
+    hyper: Hyperparams,
+    every: int,
+    due: bool,
+    was_compared: bool,
 ) -> tuple[EpochState, Float[np.ndarray, " 2"] | None]:
     """
     After an epoch: the averaged policy acts until the first comparison, then the better one does.
 
     :param every: epochs between two comparisons; 0: no comparisons
     :param due: compare after this epoch in any case, unless ``every`` is 0
+    :param was_compared: whether there was a comparison after an earlier epoch
     :return: the state, and the returns of a comparison, see :func:`keep_better`
     """
     n_epochs = int(state.progress.n_epochs)
     if is_compared(n_epochs, every, due):
         return keep_better(config, state, hyper)
-    if every and n_epochs > every:
+    if was_compared:
         return state, None
     nets = state.networks
     acting = nets._replace(acting=nets.average, acting_inside=nets.inside)

@@ -309,6 +309,11 @@ class HDS(TwinAlgorithm):
         """After real steps, the model may have changed: compare policies before one acts."""
         return self.real_timesteps > 0 and not self._replanning
 
+    @property
+    def was_compared(self) -> bool:
+        """Also before ``compare_every`` epochs: at the end of the first block of real steps."""
+        return super().was_compared or self._n_blocks > 1
+
     def varied(self, twin: Twin) -> Params:
         drawn, force = super().varied(twin), force_of(twin)
         if force is not None:
