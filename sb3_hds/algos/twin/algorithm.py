@@ -206,6 +206,8 @@ class TwinAlgorithm(TensorAlgorithm):
         except Exception:
             self.env, self.n_envs, self._vec_normalize_env, self._last_obs = before
             raise
+        if self._last_obs is None:
+            self.unstored_step = None
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -321,7 +323,11 @@ class TwinAlgorithm(TensorAlgorithm):
         return max(0.0, 1.0 - self._epochs_done / self._epochs_planned)
 
     def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any):
+        before = self._last_obs
         total_timesteps, callback = super()._setup_learn(total_timesteps, *args, **kwargs)
+        if self._last_obs is not before:
+            # The environment was reset, and the step before led elsewhere.
+            self.unstored_step = None
         steps = total_timesteps - self.num_timesteps
         self._epochs_planned = self.pretraining_due + math.ceil(steps / self._steps_per_epoch)
         self._epochs_done, self.stopped = 0, False
