@@ -222,6 +222,7 @@ class HDS(TwinAlgorithm):
         )
         found = by_data() if self.poll is no_poll else run_in_threads([by_data], self.poll)[0]
         if found.change is not None:
+            n_steps = min(n_steps, found.change.n_steps)
             self._changed_at = self.real_timesteps - found.change.n_steps
             self._changed_in, self._steps_at_force = found.change.recording, 0
         self._refitted_at = self.real_timesteps
