@@ -370,6 +370,79 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch, no_
     assert model._n_updates == 3 * (2 + 1) * 3
 
 
+def test_after_a_change_the_force_is_learned_again_once_the_data_since_have_doubled(
+    monkeypatch, no_planning
+):
+    learns = []
+    force: Any = SimpleNamespace(disagreement=0.0)
+
+    def changed(twin, *_, learn_force, n_new, **__):
+        learns.append(learn_force)
+        return Correction(
+            twin,
+            0.0,
+            changed=False,
+            change=ChangePoint(n_new, 0) if len(learns) == 2 else None,
+            residual=force if learn_force else None,
+        )
+
+    monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm.correct", changed)
+    model = real(refit_freq=0, train_freq=10).learn(20)
+    for _ in range(4):
+        model.correct_model()
+        model.learn(20)
+
+    # With 20 steps; with 40, of which 20 count from then on; with 40 of these; not yet with 60.
+    assert learns == [True, True, True, False]
+
+
+def test_what_acts_after_a_comparison_acts_until_the_next_one(monkeypatch):
+    learns, acting = [], []
+
+    def changed(twin, *_, **__):
+        learns.append(True)
+        return Correction(twin, 0.0, changed=len(learns) == 2)
+
+    def noted(self, gradient_steps):
+        usual(self, gradient_steps)
+        acting.append((self._replanning, self.policy.networks.acting))
+
+    usual = HDS.run_epoch
+    monkeypatch.setattr(HDS, "run_epoch", noted)
+    monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm.correct", changed)
+    monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm._REPLAN_EPOCHS", 2)
+    real(train_freq=25).learn(50)
+
+    assert [remaining for remaining, _ in acting] == [0, 2, 1, 0]
+    (_, compared), *again, _ = acting
+    for _, weights in again:
+        assert all(map(np.array_equal, *map(jax.tree.leaves, (weights, compared))))
+
+
+def test_a_step_that_no_callback_saw_stored_ends_with_its_episode(no_planning):
+    model = real(refit_freq=0)
+    stop = lambda *_: model.num_timesteps < 7  # noqa: E731
+
+    model.learn(25, callback=stop)
+    assert model.measured.trajectories().lengths.tolist() == [7]
+    model.learn(0)
+
+    assert model.measured.trajectories().lengths.tolist() == [6]
+    model.learn(25, callback=stop)
+    model.set_env(model.get_env())
+    assert model.measured.trajectories().lengths.tolist() == [6, 6]
+
+
+def test_a_step_that_is_not_stored_yet_leaves_the_oldest_one_in_a_full_buffer(no_planning):
+    model = real(refit_freq=0, buffer_size=10).learn(13)
+    before = columns(model)["observations"].copy()
+
+    model.learn(20, callback=lambda *_: False, reset_num_timesteps=False)
+
+    assert model.measured.trajectories().n_steps == 10
+    np.testing.assert_array_equal(columns(model)["observations"], before)
+
+
 @each(
     ({"max_saved_steps": 200}, 60, 120),
     ({"max_saved_steps": 90}, 60, 30),

@@ -353,6 +353,11 @@ class HDS(TwinAlgorithm):
         if buffer is None or step is None:
             return Source(buffer, dt, self.action_space, limit)
         buffer = copy.copy(buffer)
+        if buffer.full:
+            # The step would overwrite the oldest one, which the model still has; otherwise, it goes
+            # to a row that does not count yet.
+            arrays = {n: x.copy() for n, x in vars(buffer).items() if isinstance(x, np.ndarray)}
+            vars(buffer).update(arrays)
         before = self._last_obs, self._last_original_obs
         names = {"buffer_actions": "buffer_action", "rewards": "reward"}
         named: Any = {names.get(name, name): value for name, value in step.items()}
