@@ -16,17 +16,17 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn
 
-from sb3_hds.algos.base.config import OffPolicyConfig, schedule_of
-from sb3_hds.algos.base.construct import (
+from sb3_hds.algos.base.checks import (
     check_buffer,
     check_buffer_class,
     check_log_interval,
     check_origin,
     check_policy_kwargs,
 )
+from sb3_hds.algos.base.config import OffPolicyConfig, schedule_of
 from sb3_hds.algos.base.files import damaged, write_whole
 from sb3_hds.algos.base.policy import TensorPolicy
-from sb3_hds.algos.base.saving import SavesTensors
+from sb3_hds.algos.base.root import TensorAlgorithm
 from sb3_hds.algos.nets.options import by_names
 
 # Steps per second below which a learner warns and suggests faster settings.
@@ -129,7 +129,7 @@ def _scaled(space: spaces.Box, action: np.ndarray) -> np.ndarray:
 ExecutedReplayBuffer.__module__ = ExecutedDictReplayBuffer.__module__ = "sb3_hds.algos"
 
 
-class TensorAlgorithm(SavesTensors, OffPolicyAlgorithmJax):
+class OffPolicyTensorAlgorithm(TensorAlgorithm, OffPolicyAlgorithmJax):
     """Abstract: an off-policy algorithm whose policy is a :class:`TensorPolicy`."""
 
     default_timesteps: ClassVar[int] = 1_000
@@ -355,7 +355,7 @@ class Pace:
         """Stop timing until the next collection of steps ends."""
         self._since: float | None = None
 
-    def collected(self, model: "TensorAlgorithm", n_steps: int) -> None:
+    def collected(self, model: "OffPolicyTensorAlgorithm", n_steps: int) -> None:
         """
         Start timing: a collection of steps has ended, and its updates follow.
 
@@ -365,7 +365,7 @@ class Pace:
             self._since = time.perf_counter()
             self._new_steps, self._updates_before = n_steps, model._n_updates
 
-    def updated(self, model: "TensorAlgorithm") -> None:
+    def updated(self, model: "OffPolicyTensorAlgorithm") -> None:
         """Count the updates since :meth:`collected`, if there were any."""
         if self._since is None or model._n_updates == self._updates_before:
             return

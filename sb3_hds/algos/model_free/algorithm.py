@@ -22,7 +22,7 @@ from stable_baselines3.common.type_aliases import (
 )
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_hds.algos.base.algorithm import TensorAlgorithm
+from sb3_hds.algos.base.algorithm import OffPolicyTensorAlgorithm
 from sb3_hds.algos.base.config import Config, OffPolicyConfig, Rate, between, is_count, schedule_of
 from sb3_hds.algos.base.policy import LearningPolicy
 from sb3_hds.algos.model_free.update import Source
@@ -115,7 +115,7 @@ class ModelFreeConfig(OffPolicyConfig):
         )
 
 
-class ModelFreeAlgorithm(TensorAlgorithm):
+class ModelFreeAlgorithm(OffPolicyTensorAlgorithm):
     """
     Abstract: off-policy learning from transitions.
 

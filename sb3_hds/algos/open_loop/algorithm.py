@@ -15,15 +15,15 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_hds.algos.base.config import takes
-from sb3_hds.algos.base.construct import (
+from sb3_hds.algos.base.checks import (
     check_log_interval,
     check_origin,
     checked_timesteps,
     jax_device,
 )
+from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.base.policy import TensorPolicy
-from sb3_hds.algos.base.saving import SavesTensors
+from sb3_hds.algos.base.root import TensorAlgorithm
 from sb3_hds.algos.open_loop import cma_es
 from sb3_hds.algos.open_loop.config import OpenLoopConfig
 from sb3_hds.algos.open_loop.gait import Constants, GaitSpace
@@ -38,7 +38,7 @@ from sb3_hds.algos.open_loop.rollouts import Trial, Trials
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError
 
 
-class OpenLoop(SavesTensors):
+class OpenLoop(TensorAlgorithm):
     r"""
     One oscillator per joint, :math:`q_i^*(t) = a_i \sin(\theta_i(t) + \varphi_i) + b_i`, with one
     frequency for swing and one for stance, and a tracking loop, :math:`u = k_p (q^* - q) -

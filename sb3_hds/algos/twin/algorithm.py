@@ -20,8 +20,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
 
-from sb3_hds.algos.base.algorithm import TensorAlgorithm
-from sb3_hds.algos.base.construct import callbacks_of, jax_device
+from sb3_hds.algos.base.algorithm import OffPolicyTensorAlgorithm
+from sb3_hds.algos.base.checks import callbacks_of, jax_device
 from sb3_hds.algos.twin.config import TwinConfig, epoch_config
 from sb3_hds.algos.twin.epoch import EpochMetrics, epoch, epoch_log, programs, twin_steps_per_epoch
 from sb3_hds.algos.twin.model import (
@@ -63,7 +63,7 @@ _FEWEST_EPOCHS = 20
 _TEMPERATURE_DECAY = 0.9
 
 
-class TwinAlgorithm(TensorAlgorithm):
+class TwinAlgorithm(OffPolicyTensorAlgorithm):
     """
     Abstract: base of PODS and HDS.
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_hds import effects, twins
-from sb3_hds.algos.base.construct import in_one_line
+from sb3_hds.algos.base.checks import in_one_line
 from sb3_hds.algos.base.files import from_state_dict, to_state_dict
 from sb3_hds.algos.twin.policy import View, unclipped
 from sb3_hds.core import Effect, Twin

@@ -13,8 +13,8 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
+from sb3_hds.algos.base.checks import jax_device
 from sb3_hds.algos.base.config import between, takes
-from sb3_hds.algos.base.construct import jax_device
 from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free.sac.update import (

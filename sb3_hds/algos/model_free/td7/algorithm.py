@@ -12,8 +12,8 @@ from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import TrainFreq
 
+from sb3_hds.algos.base.checks import jax_device
 from sb3_hds.algos.base.config import takes
-from sb3_hds.algos.base.construct import jax_device
 from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
 from sb3_hds.algos.model_free.td7.policy import TD7Policy
 from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer

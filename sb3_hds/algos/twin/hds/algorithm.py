@@ -12,8 +12,8 @@ import numpy as np
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_hds.algos.base.checks import as_list
 from sb3_hds.algos.base.config import between, takes
-from sb3_hds.algos.base.construct import as_list
 from sb3_hds.algos.twin.algorithm import TwinAlgorithm
 from sb3_hds.algos.twin.config import TwinConfig
 from sb3_hds.algos.twin.hds.correction import (

@@ -15,8 +15,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_hds.algos import registry
-from sb3_hds.algos.base.config import Config, arguments_of, check_known
-from sb3_hds.algos.base.construct import (
+from sb3_hds.algos.base.checks import (
     callbacks_of,
     check_has_env,
     checked_env,
@@ -25,6 +24,7 @@ from sb3_hds.algos.base.construct import (
     in_one_line,
     policy_and_env,
 )
+from sb3_hds.algos.base.config import Config, arguments_of, check_known
 from sb3_hds.algos.base.files import damage_reported, name_of, refuse_damaged, write_whole
 from sb3_hds.algos.base.policy_file import described
 from sb3_hds.algos.nets.options import by_names
@@ -64,7 +64,7 @@ class _ByName:
         vars(model)["policy_class"] = registry.registered_name(kind) or kind
 
 
-class SavesTensors(BaseAlgorithm):
+class TensorAlgorithm(BaseAlgorithm):
     """Abstract: an algorithm whose policy is a :class:`~sb3_hds.algos.base.policy.TensorPolicy`."""
 
     policy_class = _ByName()  # type: ignore[assignment]  # SB3 annotates what it returns
