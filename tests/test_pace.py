@@ -6,8 +6,8 @@ import pytest
 from cases import each
 from small_models import small
 
-from sb3_hds.algos.base import algorithm
-from sb3_hds.algos.base.algorithm import Pace
+from sb3_hds.algos.base import pace
+from sb3_hds.algos.base.pace import Pace
 
 
 class Learner:
@@ -23,7 +23,7 @@ class Learner:
 def said(monkeypatch, seconds: list[float], n_updates: int = 1, n_steps: int = 1) -> list[str]:
     """By a learner whose calls of ``train`` take these times."""
     now, learner, looking = 0.0, Learner(), Pace()
-    monkeypatch.setattr(algorithm.time, "perf_counter", lambda: now)
+    monkeypatch.setattr(pace.time, "perf_counter", lambda: now)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for each in seconds:
@@ -58,8 +58,8 @@ def test_it_goes_by_steps_of_the_environment(seconds, n_updates, n_steps, slow, 
 
 
 def test_a_learner_says_which_of_its_arguments_matters(monkeypatch):
-    monkeypatch.setattr(algorithm, "_SLOW", 1e9)
-    monkeypatch.setattr(algorithm, "_UPDATES", 1)
+    monkeypatch.setattr(pace, "_SLOW", 1e9)
+    monkeypatch.setattr(pace, "_UPDATES", 1)
     model = small("droq", learning_starts=5)
 
     with pytest.warns(UserWarning, match="DroQ makes .* steps/s") as caught:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from sb3_hds.algos import registry
 
 if TYPE_CHECKING:
-    from sb3_hds.algos.base.algorithm import ExecutedDictReplayBuffer, ExecutedReplayBuffer
+    from sb3_hds.algos.base.executed_actions import ExecutedDictReplayBuffer, ExecutedReplayBuffer
     from sb3_hds.algos.base.policy_file import load_policy
     from sb3_hds.algos.base.threaded_training import TrainBeside
     from sb3_hds.algos.model_free.sac.algorithm import GSDESAC
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 # Public names besides algorithms and policies.
 _OTHERS = {
     "Episodes": "model_free.sac.compiled",
-    "ExecutedDictReplayBuffer": "base.algorithm",
-    "ExecutedReplayBuffer": "base.algorithm",
+    "ExecutedDictReplayBuffer": "base.executed_actions",
+    "ExecutedReplayBuffer": "base.executed_actions",
     "LapReplayBuffer": "model_free.td7.prioritized_replay",
     "SumTree": "model_free.td7.prioritized_replay",
     "TrainBeside": "base.threaded_training",

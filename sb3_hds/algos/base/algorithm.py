@@ -1,18 +1,14 @@
-"""What all off-policy algorithms share: ``learn``, checks of measurements, executed actions."""
+"""What all off-policy algorithms share: ``learn``, checks of measurements, saved replay buffers."""
 
 import copy
 import io
 import numbers
 import pathlib
-import time
-import warnings
-from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from gymnasium import spaces
 from sbx.common.off_policy_algorithm import OffPolicyAlgorithmJax
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn
 
@@ -24,109 +20,14 @@ from sb3_hds.algos.base.checks import (
     check_policy_kwargs,
 )
 from sb3_hds.algos.base.config import OffPolicyConfig, schedule_of
+from sb3_hds.algos.base.executed_actions import executed
 from sb3_hds.algos.base.files import damaged, write_whole
+from sb3_hds.algos.base.pace import Pace
 from sb3_hds.algos.base.policy import TensorPolicy
 from sb3_hds.algos.base.root import TensorAlgorithm
 from sb3_hds.algos.nets.options import by_names
 
-# Steps per second below which a learner warns and suggests faster settings.
-_SLOW = 5.0
-# Calls of ``train`` that compile and are not timed; then the number of updates to time, or the time
-# after which fewer are enough [s].
-_COMPILING, _UPDATES, _SECONDS = 2, 100, 10.0
 _STATISTICS = ("obs_rms", "ret_rms", "returns")
-# Tolerance of the limits of a stored action, for single precision, in scaled actions.
-_ROUNDING = 1e-5
-# Tolerance between the chosen action and the one that a layer received, as a share of the range.
-_REACHED = 1e-4
-
-
-def executed(
-    space: spaces.Space, chosen: np.ndarray, infos: Sequence[Mapping[str, Any]]
-) -> np.ndarray:
-    """
-    The actions to store: ``info["stored_action"]`` where a layer of ``sb3_hds.wrappers`` sets it
-    (``store="executed"``), otherwise the chosen ones.
-
-    :param space: action space
-    :param chosen: scaled to [-1, 1] where the space is a Box, shape ``(n_envs, n_act)``
-    :param infos: of the step, one for each environment
-    :return: scaled actions, shape of ``chosen``
-    :raises ValueError: for a stored action outside the space, and for a layer that received another
-        action than the chosen one
-    """
-    given = [info.get("stored_action") for info in infos]
-    if all(action is None for action in given) or not isinstance(space, spaces.Box):
-        return chosen
-    stored = np.array(chosen, copy=True)
-    for i, action in enumerate(given):
-        if action is not None:
-            found = _scaled(space, np.asarray(action, float)).reshape(stored[i].shape)
-            _check_reached(space, stored[i], infos[i])
-            stored[i] = found
-    return stored
-
-
-class _StoresExecuted:
-    """Stores executed actions (see :func:`executed`)."""
-
-    action_space: spaces.Space
-
-    def add(
-        self,
-        obs: Any,
-        next_obs: Any,
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        buffer: Any = super()
-        stored = executed(self.action_space, action, infos)
-        buffer.add(obs, next_obs, stored, reward, done, infos)
-
-
-class ExecutedReplayBuffer(_StoresExecuted, ReplayBuffer):
-    """
-    SB3's replay buffer, which stores executed actions (see :func:`executed`), for algorithms of
-    Stable-Baselines3 and SBX: ``SAC(..., replay_buffer_class=ExecutedReplayBuffer)``. The
-    model-free algorithms of this package store them in any replay buffer.
-    """
-
-
-class ExecutedDictReplayBuffer(_StoresExecuted, DictReplayBuffer):
-    """:class:`ExecutedReplayBuffer` for Dict observations."""
-
-
-def _check_reached(space: spaces.Box, chosen: np.ndarray, info: Mapping[str, Any]) -> None:
-    raw = info.get("raw_action")
-    # After `command_dropped`, a watchdog acted and nothing of the chosen action was executed.
-    if raw is None or info.get("command_dropped"):
-        return
-    low, high = space.low.astype(float), space.high.astype(float)
-    wanted = low + 0.5 * (chosen.reshape(space.shape) + 1.0) * (high - low)
-    if not np.allclose(raw, wanted, rtol=0.0, atol=_REACHED * np.max(high - low)):
-        raise ValueError(
-            f"A layer asks to store the executed form of action {raw}, but {wanted} was chosen. A "
-            "wrapper outside that layer changes actions, for example by rescaling them: move it "
-            "below the layer, or use store='raw'."
-        )
-
-
-def _scaled(space: spaces.Box, action: np.ndarray) -> np.ndarray:
-    """``BasePolicy.scale_action`` in double precision, for actions within the limits only."""
-    low, high = space.low.astype(float), space.high.astype(float)
-    scaled = 2.0 * (action - low) / (high - low) - 1.0 if action.shape == space.shape else action
-    if action.shape != space.shape or not np.all(np.abs(scaled) <= 1.0 + _ROUNDING):
-        raise ValueError(
-            f"A layer asks to store the action {action}, which is not in {space}. A wrapper "
-            "outside that layer rescales actions: move it below the layer, or use store='raw'."
-        )
-    return np.clip(scaled, -1.0, 1.0)
-
-
-# Pickled buffers refer to the public package, whose name does not change.
-ExecutedReplayBuffer.__module__ = ExecutedDictReplayBuffer.__module__ = "sb3_hds.algos"
 
 
 class OffPolicyTensorAlgorithm(TensorAlgorithm, OffPolicyAlgorithmJax):
@@ -338,51 +239,3 @@ class OffPolicyTensorAlgorithm(TensorAlgorithm, OffPolicyAlgorithmJax):
 def _is_finite(measured: Any) -> bool:
     parts = measured.values() if isinstance(measured, dict) else [measured]
     return all(np.isfinite(part).all() for part in parts)
-
-
-class Pace:
-    """
-    Times a learner's first hundred updates after compilation and warns if they are slow. Time spent
-    in the environment and in callbacks does not count.
-    """
-
-    def __init__(self) -> None:
-        self._calls, self._seconds, self._steps, self._updates = 0, 0.0, 0, 0
-        self._done = False
-        self.pause()
-
-    def pause(self) -> None:
-        """Stop timing until the next collection of steps ends."""
-        self._since: float | None = None
-
-    def collected(self, model: "OffPolicyTensorAlgorithm", n_steps: int) -> None:
-        """
-        Start timing: a collection of steps has ended, and its updates follow.
-
-        :param n_steps: steps of the environment in the collection
-        """
-        if not self._done:
-            self._since = time.perf_counter()
-            self._new_steps, self._updates_before = n_steps, model._n_updates
-
-    def updated(self, model: "OffPolicyTensorAlgorithm") -> None:
-        """Count the updates since :meth:`collected`, if there were any."""
-        if self._since is None or model._n_updates == self._updates_before:
-            return
-        seconds, self._since = time.perf_counter() - self._since, None
-        self._calls += 1
-        if self._calls <= _COMPILING:
-            return
-        self._seconds += seconds
-        self._steps += self._new_steps
-        self._updates += model._n_updates - self._updates_before
-        if self._updates < _UPDATES and self._seconds < _SECONDS:
-            return
-        self._done = True
-        rate = self._steps / max(self._seconds, 1e-9)
-        if rate < _SLOW:
-            remedies = model.remedies(self._updates / max(self._steps, 1))
-            warnings.warn(
-                f"{type(model).__name__} makes {rate:.2g} steps/s, since the updates for each step "
-                f"take {1.0 / rate:.2g} s. What would make it faster: {'; '.join(remedies)}."
-            )
