@@ -22,6 +22,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 
 from sb3_hds.algos.base.algorithm import OffPolicyTensorAlgorithm
 from sb3_hds.algos.base.checks import callbacks_of, jax_device
+from sb3_hds.algos.twin.comparison import (
+    choose_policy,
+    comparison,
+    is_compared,
+    twin_steps_per_comparison,
+)
 from sb3_hds.algos.twin.config import TwinConfig, epoch_config
 from sb3_hds.algos.twin.epoch import EpochMetrics, epoch, epoch_log, programs, twin_steps_per_epoch
 from sb3_hds.algos.twin.model import (
@@ -35,13 +41,7 @@ from sb3_hds.algos.twin.model import (
     view_of,
 )
 from sb3_hds.algos.twin.policy import TwinPolicy, all_finite
-from sb3_hds.algos.twin.pretraining import Pretraining, no_poll, run_in_thread, run_in_threads
-from sb3_hds.algos.twin.regression import (
-    choose_policy,
-    comparison,
-    is_compared,
-    twin_steps_per_comparison,
-)
+from sb3_hds.algos.twin.pretraining import Pretraining
 from sb3_hds.algos.twin.state import (
     EpochConfig,
     EpochState,
@@ -50,6 +50,7 @@ from sb3_hds.algos.twin.state import (
     init_workspace,
     longest_episode,
 )
+from sb3_hds.algos.twin.threads import no_poll, run_in_thread, run_in_threads
 from sb3_hds.core import Params, Twin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.core.numerics.compilation import GENERATOR
@@ -69,7 +70,7 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
 
     ``learn`` runs the planning epochs of the pretraining (``pretraining.py``), then SB3 alternates
     between real steps and :meth:`train`. Both call :meth:`run_epoch`: ``epoch`` (``epoch.py``)
-    plans in the twin and regresses the policy on the plans, ``choose_policy`` (``regression.py``)
+    plans in the twin and regresses the policy on the plans, ``choose_policy`` (``comparison.py``)
     decides which policy acts.
     """
 

@@ -1,7 +1,6 @@
 """Planning epochs before the first real step, and how callbacks and loggers see them."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -15,10 +14,10 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.logger import Logger
 
+from sb3_hds.algos.twin.threads import no_poll
+
 # Number of log lines during the pretraining.
 _N_LOGS = 10
-# Time between two calls of callbacks while programs compile [s].
-_PATIENCE = 0.5
 
 
 class Pretraining(CallbackList):
@@ -123,43 +122,6 @@ class OwnSeries(Logger):
         self._logger.dump(self._n_epochs())
         for kept in (self.name_to_value, self.name_to_count, self.name_to_excluded):
             kept.clear()
-
-
-def no_poll() -> None:
-    """Do nothing: the value of ``poll`` outside the pretraining."""
-
-
-def run_in_thread(work: Callable[[], Any]) -> Future[Any]:
-    """
-    :param work: a function without side effects
-    :return: its future result; it runs in another thread, for which Python waits before it exits
-    """
-    pool = ThreadPoolExecutor(1)
-    try:
-        return pool.submit(work)
-    finally:
-        pool.shutdown(wait=False)
-
-
-def run_in_threads(works: Sequence[Callable[[], Any]], poll: Callable[[], None]) -> list[Any]:
-    """
-    Run functions in other threads, so that this one can be interrupted.
-
-    An interrupt ends the waiting only: the functions continue, their results are lost, and Python
-    waits for them before it exits.
-
-    :param works: functions without side effects
-    :param poll: is called twice a second; an error that it raises ends the waiting
-    :return: the results of the functions
-    """
-    pool = ThreadPoolExecutor(len(works))
-    try:
-        futures = [pool.submit(work) for work in works]
-        while wait(futures, _PATIENCE).not_done:
-            poll()
-        return [future.result() for future in futures]
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _step_placeholder(model: Any) -> dict[str, Any]:

@@ -1,18 +1,15 @@
-"""Regression of policy and value on plans, and the choice of the policy that acts."""
+"""Regression of policy and value on plans: the second half of an epoch, and its samples."""
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sb3_hds.algos.twin.policy import (
-    View,
     clipped_adam,
     output,
     squash,
@@ -24,13 +21,10 @@ from sb3_hds.algos.twin.state import (
     EpochState,
     Hyperparams,
     Samples,
-    grouped_vmap,
-    longest_episode,
-    resets,
 )
-from sb3_hds.core import Twin
-from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION
-from sb3_hds.planning import Plan, Problem, follow
+from sb3_hds.algos.twin.threads import run_in_parallel
+from sb3_hds.core.numerics.compilation import GENERATOR
+from sb3_hds.planning import Plan, Problem
 
 # Error below which the absolute loss becomes quadratic, in units of the control scale.
 _SMOOTH_ERROR = 0.1
@@ -40,91 +34,34 @@ _FORGETTING = 3.0
 _LEAST_STD, _LEAST_CONTROL = 1e-6, 1e-3
 # Largest weight of a sample, in units of the mean weight.
 _LARGEST_WEIGHT = 20.0
-# Simulated steps of each policy in a comparison, and the limits of the number of episodes.
-_STEPS_COMPARED = 64_000
-_FEWEST, _MOST = 32, 256
 
 
-def samples_of(
-    hyper: Hyperparams,
-    problem: Problem,
-    kept: Plan,
-    tails: Float[Array, " rollouts"],
-    gain: Float[Array, " rollouts"],
-    sensitivity: Float[Array, "rollouts horizon"],
-) -> tuple[Samples, Bool[Array, " rollouts"]]:
-    r"""
-    Samples at every state of the *improved* trajectories: the control, the objective from there on
-
-    .. math:: Y_t = r_t + \gamma Y_{t+1}
-
-    and a weight that grows with the plan's gain over the policy and with the cost of an error.
-
-    :param kept: plans, leaves of shape ``(n_rollouts, ...)``
-    :param tails: value of each plan's last state
-    :param gain: of each plan over the policy's own
-    :param sensitivity: cost of an error in each control
-    :return: samples, leaves of shape ``(horizon * n_rollouts, ...)``, and which plans were finite;
-        the others have weight zero
+def learn_from_plans(
+    config: EpochConfig, state: EpochState, hyper: Hyperparams
+) -> tuple[EpochState, tuple[Any, Any, Any]]:
     """
-    before = jax.tree.map(lambda leaf: leaf[:, :-1], kept.states)
-    obs = jax.vmap(jax.vmap(lambda state: hyper.view(problem.observe(state))))(before)
-    targets = jax.vmap(lambda plan, tail: _to_go(problem, plan, tail))(kept, tails)
-    finite = jnp.isfinite(obs).all((1, 2)) & jnp.isfinite(targets).all(1) & jnp.isfinite(kept.value)
-    alive = finite[:, None] & kept.alive[:, :-1]
-    weight = _weight(gain, hyper.gain_weight)[:, None] * _weight(
-        sensitivity, hyper.sensitivity_weight
-    )
+    The second half of an epoch: the regressions of policy and value. They are independent and run
+    in parallel, since with small networks, each uses little more than one core.
 
-    def flat(x: jax.Array) -> jax.Array:
-        clean = jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0)
-        return jnp.swapaxes(clean, 0, 1).reshape(-1, *x.shape[2:])
-
-    samples = Samples(
-        flat(obs),
-        flat(kept.controls),
-        flat(targets),
-        flat(jnp.where(alive, weight, 0.0)),
-        flat(alive.astype(weight.dtype)),
-    )
-    return samples, finite
-
-
-def remember(config: EpochConfig, state: EpochState, samples: Samples) -> EpochState:
-    """Replace the oldest row of samples by those of this epoch."""
-    work = state.workspace
-    row = work.n_filled % config.plan_memory
-    write = lambda rows, new: jax.lax.dynamic_update_index_in_dim(rows, new, row, 0)  # noqa: E731
-    rows = jax.tree.map(write, work.samples, samples)
-    return state._replace(workspace=work._replace(samples=rows, n_filled=work.n_filled + 1))
-
-
-def rescale(state: EpochState, samples: Samples) -> EpochState:
+    :return: the state; the mean losses of policy and value, and the mean norm of the policy's
+        gradient before it is clipped
     """
-    Let the scales of inputs and controls follow the plans, at a rate of 3 / (n + 3) after n epochs:
-    near a balance, both are far smaller than in the first, random rollouts. The networks' first
-    layers change with the scales of their inputs, so that their outputs stay the same.
-    """
-    nets, progress = state.networks, state.progress
-    counted = samples.alive[:, None]
-    rate = _FORGETTING / (progress.n_epochs + _FORGETTING) * jnp.any(counted > 0.0)
-    total = jnp.maximum(jnp.sum(counted), 1.0)
-    mean = jnp.sum(counted * samples.obs, 0) / total
-    std = jnp.sqrt(jnp.sum(counted * (samples.obs - mean) ** 2, 0) / total)
-    sizes = jnp.log(jnp.abs(samples.control) + _LEAST_CONTROL)
-    control_scale = jnp.exp(jnp.sum(counted * sizes, 0) / total)
-    update = lambda old, new: old + rate * (new - old)  # noqa: E731
-    std = jnp.where(std > _LEAST_STD, std, nets.inside.scale)
-    inside = nets.inside._replace(
-        mean=update(nets.inside.mean, mean), scale=update(nets.inside.scale, std)
-    )
-    control_scale = jnp.clip(update(progress.control_scale, control_scale), _LEAST_CONTROL, 1.0)
-    actor, average, value = (
-        with_input_scales(weights, nets.inside, inside)
-        for weights in (nets.actor, nets.average, nets.value)
-    )
-    nets = nets._replace(actor=actor, average=average, value=value, inside=inside)
-    return state._replace(networks=nets, progress=progress._replace(control_scale=control_scale))
+    learning = [partial(each, config, state, hyper) for each in regressions(config)]
+    of_policy, *of_value = run_in_parallel(learning)
+    actor, average, optimizer, loss, norm, n_epochs, key = of_policy
+    nets = state.networks._replace(actor=actor, average=average)
+    progress = state.progress._replace(actor_optimizer=optimizer, n_epochs=n_epochs, key=key)
+    value_loss: Any = 0.0
+    if of_value:
+        value, optimizer, value_loss = of_value[0]
+        nets = nets._replace(value=value)
+        progress = progress._replace(value_optimizer=optimizer)
+    return state._replace(networks=nets, progress=progress), (loss, value_loss, norm)
+
+
+def regressions(config: EpochConfig) -> list[Callable[..., Any]]:
+    """:return: the programs of the second half of an epoch"""
+    return [learn_policy, *([learn_value] if config.terminal_value else [])]
 
 
 @partial(jax.jit, static_argnums=0)
@@ -218,6 +155,93 @@ def _descent(
     return weights, optimizer, sums / jnp.maximum(hyper.gradient_steps, 1)
 
 
+def _next_keys(state: EpochState) -> jax.Array:
+    """:return: the random key after this half of the epoch, and the one to use in it"""
+    return jax.random.split(jax.random.wrap_key_data(state.progress.key, impl=GENERATOR))
+
+
+def samples_of(
+    hyper: Hyperparams,
+    problem: Problem,
+    kept: Plan,
+    tails: Float[Array, " rollouts"],
+    gain: Float[Array, " rollouts"],
+    sensitivity: Float[Array, "rollouts horizon"],
+) -> tuple[Samples, Bool[Array, " rollouts"]]:
+    r"""
+    Samples at every state of the *improved* trajectories: the control, the objective from there on
+
+    .. math:: Y_t = r_t + \gamma Y_{t+1}
+
+    and a weight that grows with the plan's gain over the policy and with the cost of an error.
+
+    :param kept: plans, leaves of shape ``(n_rollouts, ...)``
+    :param tails: value of each plan's last state
+    :param gain: of each plan over the policy's own
+    :param sensitivity: cost of an error in each control
+    :return: samples, leaves of shape ``(horizon * n_rollouts, ...)``, and which plans were finite;
+        the others have weight zero
+    """
+    before = jax.tree.map(lambda leaf: leaf[:, :-1], kept.states)
+    obs = jax.vmap(jax.vmap(lambda state: hyper.view(problem.observe(state))))(before)
+    targets = jax.vmap(lambda plan, tail: _to_go(problem, plan, tail))(kept, tails)
+    finite = jnp.isfinite(obs).all((1, 2)) & jnp.isfinite(targets).all(1) & jnp.isfinite(kept.value)
+    alive = finite[:, None] & kept.alive[:, :-1]
+    weight = _weight(gain, hyper.gain_weight)[:, None] * _weight(
+        sensitivity, hyper.sensitivity_weight
+    )
+
+    def flat(x: jax.Array) -> jax.Array:
+        clean = jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0)
+        return jnp.swapaxes(clean, 0, 1).reshape(-1, *x.shape[2:])
+
+    samples = Samples(
+        flat(obs),
+        flat(kept.controls),
+        flat(targets),
+        flat(jnp.where(alive, weight, 0.0)),
+        flat(alive.astype(weight.dtype)),
+    )
+    return samples, finite
+
+
+def remember(config: EpochConfig, state: EpochState, samples: Samples) -> EpochState:
+    """Replace the oldest row of samples by those of this epoch."""
+    work = state.workspace
+    row = work.n_filled % config.plan_memory
+    write = lambda rows, new: jax.lax.dynamic_update_index_in_dim(rows, new, row, 0)  # noqa: E731
+    rows = jax.tree.map(write, work.samples, samples)
+    return state._replace(workspace=work._replace(samples=rows, n_filled=work.n_filled + 1))
+
+
+def rescale(state: EpochState, samples: Samples) -> EpochState:
+    """
+    Let the scales of inputs and controls follow the plans, at a rate of 3 / (n + 3) after n epochs:
+    near a balance, both are far smaller than in the first, random rollouts. The networks' first
+    layers change with the scales of their inputs, so that their outputs stay the same.
+    """
+    nets, progress = state.networks, state.progress
+    counted = samples.alive[:, None]
+    rate = _FORGETTING / (progress.n_epochs + _FORGETTING) * jnp.any(counted > 0.0)
+    total = jnp.maximum(jnp.sum(counted), 1.0)
+    mean = jnp.sum(counted * samples.obs, 0) / total
+    std = jnp.sqrt(jnp.sum(counted * (samples.obs - mean) ** 2, 0) / total)
+    sizes = jnp.log(jnp.abs(samples.control) + _LEAST_CONTROL)
+    control_scale = jnp.exp(jnp.sum(counted * sizes, 0) / total)
+    update = lambda old, new: old + rate * (new - old)  # noqa: E731
+    std = jnp.where(std > _LEAST_STD, std, nets.inside.scale)
+    inside = nets.inside._replace(
+        mean=update(nets.inside.mean, mean), scale=update(nets.inside.scale, std)
+    )
+    control_scale = jnp.clip(update(progress.control_scale, control_scale), _LEAST_CONTROL, 1.0)
+    actor, average, value = (
+        with_input_scales(weights, nets.inside, inside)
+        for weights in (nets.actor, nets.average, nets.value)
+    )
+    nets = nets._replace(actor=actor, average=average, value=value, inside=inside)
+    return state._replace(networks=nets, progress=progress._replace(control_scale=control_scale))
+
+
 def _to_go(problem: Problem, plan: Plan, tail: jax.Array) -> Float[Array, " horizon"]:
     def back(after, stage):
         reward, still = stage
@@ -232,143 +256,3 @@ def _weight(quantity: jax.Array, share: float | jax.Array) -> jax.Array:
     finite = jnp.where(jnp.isfinite(quantity), quantity, 0.0)
     relative = finite / (jnp.mean(finite) + 1e-6)
     return 1.0 - share + share * jnp.minimum(relative, _LARGEST_WEIGHT)
-
-
-def learn_from_plans(
-    config: EpochConfig, state: EpochState, hyper: Hyperparams
-) -> tuple[EpochState, tuple[Any, Any, Any]]:
-    """
-    The second half of an epoch: the regressions of policy and value. They are independent and run
-    in parallel, since with small networks, each uses little more than one core.
-
-    :return: the state; the mean losses of policy and value, and the mean norm of the policy's
-        gradient before it is clipped
-    """
-    learning = [partial(each, config, state, hyper) for each in regressions(config)]
-    of_policy, *of_value = run_in_parallel(learning)
-    actor, average, optimizer, loss, norm, n_epochs, key = of_policy
-    nets = state.networks._replace(actor=actor, average=average)
-    progress = state.progress._replace(actor_optimizer=optimizer, n_epochs=n_epochs, key=key)
-    value_loss: Any = 0.0
-    if of_value:
-        value, optimizer, value_loss = of_value[0]
-        nets = nets._replace(value=value)
-        progress = progress._replace(value_optimizer=optimizer)
-    return state._replace(networks=nets, progress=progress), (loss, value_loss, norm)
-
-
-def regressions(config: EpochConfig) -> list[Callable[..., Any]]:
-    """:return: the programs of the second half of an epoch"""
-    return [learn_policy, *([learn_value] if config.terminal_value else [])]
-
-
-def run_in_parallel(works: Sequence[Callable[[], Any]]) -> list[Any]:
-    """
-    :param works: functions without side effects; the first one runs in this thread
-    :return: their results
-    """
-    first, *others = works
-    if not others:
-        return [first()]
-    with ThreadPoolExecutor(len(others)) as pool:
-        beside = [pool.submit(other) for other in others]
-        return [first(), *(each.result() for each in beside)]
-
-
-def _next_keys(state: EpochState) -> jax.Array:
-    """:return: the random key after this half of the epoch, and the one to use in it"""
-    return jax.random.split(jax.random.wrap_key_data(state.progress.key, impl=GENERATOR))
-
-
-def choose_policy(
-    config: EpochConfig,
-    state: EpochState,
-    hyper: Hyperparams,
-    every: int,
-    due: bool,
-    was_compared: bool,
-) -> tuple[EpochState, Float[np.ndarray, " 2"] | None]:
-    """
-    After an epoch: the averaged policy acts until the first comparison, then the better one does.
-
-    :param every: epochs between two comparisons; 0: no comparisons
-    :param due: compare after this epoch in any case, unless ``every`` is 0
-    :param was_compared: whether there was a comparison after an earlier epoch
-    :return: the state, and the returns of a comparison, see :func:`keep_better`
-    """
-    n_epochs = int(state.progress.n_epochs)
-    if is_compared(n_epochs, every, due):
-        return keep_better(config, state, hyper)
-    if was_compared:
-        return state, None
-    nets = state.networks
-    acting = nets._replace(acting=nets.average, acting_inside=nets.inside)
-    return state._replace(networks=acting), None
-
-
-def is_compared(n_epochs: int, every: int, due: bool) -> bool:
-    """:return: whether policies are compared after this number of epochs"""
-    return every > 0 and (due or n_epochs % every == 0)
-
-
-def comparison(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Callable[[], Any]:
-    """:return: the program of a comparison, to be compiled by running it once"""
-    nets = state.networks
-    given = (state.progress.key, nets.average, nets.inside)
-    return partial(mean_return, config, hyper, *given)
-
-
-def twin_steps_per_comparison(config: EpochConfig) -> int:
-    """:return: simulated steps of a comparison, if no episode ends early"""
-    return 2 * _n_starts(config.twin) * longest_episode(config.twin)
-
-
-def keep_better(
-    config: EpochConfig, state: EpochState, hyper: Hyperparams
-) -> tuple[EpochState, Float[np.ndarray, " 2"]]:
-    """
-    Compare the averaged policy with the one that acts on full episodes of the twin from the same
-    start states, and let the better one act: for a system that can fall, a single epoch may spoil
-    the policy.
-
-    :return: the state, and the mean return of both, in planning rewards
-    """
-    nets, progress = state.networks, state.progress
-    pairs = ((nets.average, nets.inside), (nets.acting, nets.acting_inside))
-    going = [partial(mean_return, config, hyper, progress.key, *pair) for pair in pairs]
-    (of_average, key), (of_acting, _) = run_in_parallel(going)
-    returns = np.array([float(of_average), float(of_acting)], np.float32)
-    acting, inside = pairs[0] if returns[0] > returns[1] else pairs[1]
-    return state._replace(
-        networks=nets._replace(acting=acting, acting_inside=inside),
-        progress=progress._replace(key=key),
-    ), returns
-
-
-@partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
-def mean_return(
-    config: EpochConfig,
-    hyper: Hyperparams,
-    key: jax.Array,
-    actor: Mapping[str, Any],
-    inside: View,
-) -> tuple[jax.Array, jax.Array]:
-    """
-    :param key: random key, as integers
-    :return: mean return of a policy over full episodes of the twin, in planning rewards; the next
-        random key
-    """
-    after, k_starts = jax.random.split(jax.random.wrap_key_data(key, impl=GENERATOR))
-    twin = config.twin
-    problem = Problem(twin, hyper.params)
-    starts = resets(twin, hyper.params, k_starts, _n_starts(twin))
-    length = longest_episode(twin)
-    rollouts = np.linspace(0, config.n_rollouts - 1, _n_starts(twin)).round().astype(int)
-    varied = jax.tree.map(lambda leaf: leaf[rollouts], hyper.varied)
-    policy = lambda obs: output(config.actor, actor, inside(hyper.view(obs)))  # noqa: E731
-    value = lambda s, own: follow(problem.with_params(own), s, policy, length).value  # noqa: E731
-    return jnp.mean(grouped_vmap(value, starts, varied)), jax.random.key_data(after)
-
-
-def _n_starts(twin: Twin) -> int:
-    return int(np.clip(_STEPS_COMPARED // longest_episode(twin), _FEWEST, _MOST))
