@@ -30,7 +30,7 @@ from sb3_hds.algos.twin.comparison import (
 )
 from sb3_hds.algos.twin.config import TwinConfig, epoch_config
 from sb3_hds.algos.twin.epoch import EpochMetrics, epoch, epoch_log, programs, twin_steps_per_epoch
-from sb3_hds.algos.twin.model import (
+from sb3_hds.algos.twin.planning_twin import (
     Tensors,
     check_reward,
     check_twin_observes,
@@ -41,7 +41,7 @@ from sb3_hds.algos.twin.model import (
     view_of,
 )
 from sb3_hds.algos.twin.policy import TwinPolicy, all_finite
-from sb3_hds.algos.twin.pretraining import Pretraining
+from sb3_hds.algos.twin.pretraining import PretrainingCallback
 from sb3_hds.algos.twin.state import (
     EpochConfig,
     EpochState,
@@ -366,7 +366,7 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
         self._epochs_done += planned - 1 - self.pretraining_due
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        around = Pretraining(callbacks_of(callback), progress_bar)
+        around = PretrainingCallback(callbacks_of(callback), progress_bar)
         return super()._init_callback(around, progress_bar)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

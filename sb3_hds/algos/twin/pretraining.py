@@ -20,7 +20,7 @@ from sb3_hds.algos.twin.threads import no_poll
 _N_LOGS = 10
 
 
-class Pretraining(CallbackList):
+class PretrainingCallback(CallbackList):
     """
     Run the planning epochs that are due when training starts, after SB3 has set up everything for
     ``learn`` (logger, other callbacks, environment). An interrupted model continues where it

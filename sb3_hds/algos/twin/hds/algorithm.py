@@ -24,7 +24,7 @@ from sb3_hds.algos.twin.hds.correction import (
     names_to_estimate,
 )
 from sb3_hds.algos.twin.hds.recorded_steps import RecordedSteps, Source, data_from
-from sb3_hds.algos.twin.model import missing_effects, nulls_of, required
+from sb3_hds.algos.twin.planning_twin import missing_effects, nulls_of, required
 from sb3_hds.algos.twin.threads import no_poll, run_in_threads
 from sb3_hds.core import Effect, Params, Trajectories, Twin
 from sb3_hds.core.twin import plant_of

@@ -19,7 +19,7 @@ from sb3_hds.algos.twin.hds.windows import (
     shares_of,
     windows_of,
 )
-from sb3_hds.algos.twin.model import missing_effects, nulls_of
+from sb3_hds.algos.twin.planning_twin import missing_effects, nulls_of
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.errors import CalibrationError, TrajectoryError
 from sb3_hds.sysid import Fit
