@@ -31,14 +31,14 @@ from sb3_hds.algos.twin.comparison import (
 from sb3_hds.algos.twin.config import TwinConfig, epoch_config
 from sb3_hds.algos.twin.epoch import EpochMetrics, epoch, epoch_log, programs, twin_steps_per_epoch
 from sb3_hds.algos.twin.planning_twin import (
-    Tensors,
+    LearnedTensors,
     check_reward,
     check_twin_observes,
+    normalization_of,
     prepare_statistics,
-    required,
+    require_twin,
     twin_from_spec,
     twin_given,
-    view_of,
 )
 from sb3_hds.algos.twin.policy import TwinPolicy, all_finite
 from sb3_hds.algos.twin.pretraining import PretrainingCallback
@@ -93,7 +93,7 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
         # A step that was passed to callbacks and not yet added to the replay buffer.
         self.unstored_step: dict[str, Any] | None = None
         self.real_timesteps, self.twin_timesteps = 0, 0
-        self.learned_force = Tensors(self)
+        self.learned_force = LearnedTensors(self)
         self._n_updates = 0
         # In the current call of ``learn``.
         self._epochs_planned, self._epochs_done = 0, 0
@@ -191,7 +191,7 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
             sensitivity_weight=how.sensitivity_weight,
             averaging=how.averaging,
             gradient_steps=gradient_steps,
-            view=self._view(twin),
+            vec_normalize=self._normalization(twin),
         )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -292,10 +292,10 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
     @property
     def _program(self) -> EpochConfig:
         """Static configuration of an epoch."""
-        return epoch_config(self.config, self.policy, required(self.twin, self.twin_spec))
+        return epoch_config(self.config, self.policy, require_twin(self.twin, self.twin_spec))
 
-    def _view(self, twin: Twin) -> Any:
-        return view_of(self.get_vec_normalize_env(), len(twin.channels))
+    def _normalization(self, twin: Twin) -> Any:
+        return normalization_of(self.get_vec_normalize_env(), len(twin.channels))
 
     def _epoch_state(self) -> EpochState:
         """The state that an epoch changes; before the first one, find the scales of the task."""
@@ -306,8 +306,8 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
             if fresh:
                 seed = int(np.asarray(policy.progress.key)[0])
                 prepare_statistics(self.get_vec_normalize_env(), program.twin, jax.random.key(seed))
-            view, params = self._view(program.twin), program.twin.params
-            started = partial(init_workspace, program, params, view, policy.progress)
+            normalization, params = self._normalization(program.twin), program.twin.params
+            started = partial(init_workspace, program, params, normalization, policy.progress)
             [(workspace, scales, progress)] = run_in_threads([started], self.poll)
             if fresh:
                 policy.networks = policy.networks._replace(inside=scales.inside)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sb3_hds.algos.twin.policy import View, output
+from sb3_hds.algos.twin.policy import Normalization, output
 from sb3_hds.algos.twin.state import (
     EpochConfig,
     EpochState,
@@ -99,7 +99,7 @@ def mean_return(
     hyper: Hyperparams,
     key: jax.Array,
     actor: Mapping[str, Any],
-    inside: View,
+    inside: Normalization,
 ) -> tuple[jax.Array, jax.Array]:
     """
     :param key: random key, as integers
@@ -113,7 +113,7 @@ def mean_return(
     length = longest_episode(twin)
     rollouts = np.linspace(0, config.n_rollouts - 1, _n_starts(twin)).round().astype(int)
     varied = jax.tree.map(lambda leaf: leaf[rollouts], hyper.varied)
-    policy = lambda obs: output(config.actor, actor, inside(hyper.view(obs)))  # noqa: E731
+    policy = lambda obs: output(config.actor, actor, inside(hyper.vec_normalize(obs)))  # noqa: E731
     value = lambda s, own: follow(problem.with_params(own), s, policy, length).value  # noqa: E731
     return jnp.mean(grouped_vmap(value, starts, varied)), jax.random.key_data(after)
 

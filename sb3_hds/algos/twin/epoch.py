@@ -156,7 +156,7 @@ def plan_ahead(
 
 def control_of(config: EpochConfig, state: EpochState, hyper: Hyperparams, obs: Obs) -> Control:
     """:return: control of the policy in training for an observation of the twin"""
-    seen = state.networks.inside(hyper.view(obs))
+    seen = state.networks.inside(hyper.vec_normalize(obs))
     return output(config.actor, state.networks.actor, seen)
 
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_hds import effects, twins
 from sb3_hds.algos.base.checks import in_one_line
 from sb3_hds.algos.base.files import from_state_dict, to_state_dict
-from sb3_hds.algos.twin.policy import View, unclipped
+from sb3_hds.algos.twin.policy import Normalization, unclipped
 from sb3_hds.core import Effect, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.errors import EnvironmentMismatchError, NoTwinError, RewardError
@@ -69,7 +69,7 @@ def twin_given(twin: Any) -> Twin | None:
     )
 
 
-def required(twin: Twin | None, spec: dict[str, Any] | None) -> Twin:
+def require_twin(twin: Twin | None, spec: dict[str, Any] | None) -> Twin:
     """
     :param spec: of a saved twin that is not registered here
     :return: the twin
@@ -136,7 +136,7 @@ def _places(twin: Twin) -> dict[str, Any]:
     return {"joint": twin.joints, "actuator": twin.actuators, "channel": twin.channels}
 
 
-class Tensors:
+class LearnedTensors:
     """
     The learned arrays of a model's twin, as SB3 saves a network.
 
@@ -157,16 +157,16 @@ class Tensors:
             self._model.twin = twin.with_tensors(tensors)
 
 
-def view_of(normalise: VecNormalize | None, n_obs: int) -> View:
+def normalization_of(normalise: VecNormalize | None, n_obs: int) -> Normalization:
     """
     :param normalise: the environment's normalisation, if it has one
     :return: its effect on observations of the twin
     """
     if normalise is None or not normalise.norm_obs:
-        return View(jnp.zeros(n_obs), jnp.ones(n_obs), unclipped())
+        return Normalization(jnp.zeros(n_obs), jnp.ones(n_obs), unclipped())
     statistics: Any = normalise.obs_rms
     scale = np.sqrt(statistics.var + normalise.epsilon)
-    return View(
+    return Normalization(
         jnp.asarray(statistics.mean, jnp.float32),
         jnp.asarray(scale, jnp.float32),
         jnp.asarray(normalise.clip_obs, jnp.float32),

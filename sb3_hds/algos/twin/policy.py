@@ -101,15 +101,15 @@ def with_input_scales(weights: Mapping[str, Any], old: Any, new: Any) -> Mapping
 
 def value_of(roots: Float[Array, "*batch roots"]) -> Float[Array, "*batch"]:
     r"""
-    :math:`V = u(\rho_0) - \sum_{i \geq 1} \rho_i^2`, with :func:`unsquash` for :math:`u`.
+    :math:`V = u(\rho_0) - \sum_{i \geq 1} \rho_i^2`, with :func:`value_of_root` for :math:`u`.
 
     Near a goal the value is minus a quadratic form. Squares represent it exactly, and their slopes
     give its curvature.
     """
-    return unsquash(roots[..., 0]) - jnp.sum(roots[..., 1:] ** 2, -1)
+    return value_of_root(roots[..., 0]) - jnp.sum(roots[..., 1:] ** 2, -1)
 
 
-def squash(value: jax.Array) -> jax.Array:
+def root_of_value(value: jax.Array) -> jax.Array:
     r"""
     The root :math:`y` that the value network learns: :math:`y\,(|y| + 0.3) = V`.
 
@@ -119,8 +119,8 @@ def squash(value: jax.Array) -> jax.Array:
     return jnp.sign(value) * (jnp.sqrt(_NEAR_ZERO**2 + 4.0 * jnp.abs(value)) - _NEAR_ZERO) / 2.0
 
 
-def unsquash(root: jax.Array) -> jax.Array:
-    """:return: the value of a root; the inverse of :func:`squash`"""
+def value_of_root(root: jax.Array) -> jax.Array:
+    """:return: the value of a root; the inverse of :func:`root_of_value`"""
     return root * (jnp.abs(root) + _NEAR_ZERO)
 
 
@@ -130,7 +130,7 @@ def _mlp(x: jax.Array, net_arch: Sequence[int], activation_fn: Activation) -> ja
     return x
 
 
-class View(NamedTuple):
+class Normalization(NamedTuple):
     """
     An affine map with clipping, as ``VecNormalize`` applies to observations.
 
@@ -162,12 +162,12 @@ class Networks(NamedTuple):
     actor: Mapping[str, Any]
     average: Mapping[str, Any]
     value: Mapping[str, Any]
-    inside: View
+    inside: Normalization
     acting: Mapping[str, Any]
-    acting_inside: View
+    acting_inside: Normalization
 
 
-class Progress(NamedTuple):
+class TrainingState(NamedTuple):
     """
     Training state besides the networks, saved with a model.
 
@@ -194,15 +194,15 @@ class Progress(NamedTuple):
 @partial(jax.jit, static_argnums=(0, 1, 2, 3), compiler_options=QUICKEST_COMPILATION)
 def fresh_networks(
     actor: Actor, value: Value, n_obs: int, max_grad_norm: float, key: PRNGKeyArray
-) -> tuple[Networks, Progress]:
+) -> tuple[Networks, TrainingState]:
     """:return: networks and training state before the first epoch, with scales of one"""
     k_actor, k_value, k_next = jax.random.split(key, 3)
     obs = jnp.zeros(n_obs)
     weights, value_weights = actor.init(k_actor, obs), value.init(k_value, obs)
-    inside = View(jnp.zeros(n_obs), jnp.ones(n_obs), unclipped())
+    inside = Normalization(jnp.zeros(n_obs), jnp.ones(n_obs), unclipped())
     adam = clipped_adam(max_grad_norm)
     zero = jnp.zeros(())
-    progress = Progress(
+    progress = TrainingState(
         adam.init(weights),
         adam.init(value_weights),
         jnp.ones(()),
@@ -271,7 +271,7 @@ class TwinPolicy(TensorPolicy):
         self.value_network = Value(vf, function)
         self.max_grad_norm = config.max_grad_norm
         self.networks: Networks
-        self.progress: Progress
+        self.progress: TrainingState
         self.build(jax.random.key(0, impl=GENERATOR), jax.devices()[0])
 
     def build(self, key: jax.Array, device: Any) -> None:
@@ -299,12 +299,12 @@ class TwinPolicy(TensorPolicy):
         self.networks = tree
 
     @property
-    def training_state(self) -> Progress:
+    def training_state(self) -> TrainingState:
         """Random keys are stored as 64-bit integers, which torch can hold."""
         return self.progress._replace(key=np.asarray(self.progress.key, np.int64))
 
     @training_state.setter
-    def training_state(self, tree: Progress) -> None:
+    def training_state(self, tree: TrainingState) -> None:
         key = jnp.asarray(np.asarray(tree.key).astype(np.uint32))
         placed = jax.device_put(key, self.progress.key.sharding)
         self.progress = tree._replace(key=placed)

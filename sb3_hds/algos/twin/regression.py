@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from sb3_hds.algos.twin.policy import (
     clipped_adam,
     output,
-    squash,
+    root_of_value,
     value_of,
     with_input_scales,
 )
@@ -116,7 +116,7 @@ def learn_value(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> t
 
     def loss(value, batch: Samples) -> jax.Array:
         found = value_of(output(config.value, value, inside(batch.obs)))
-        error = squash(found) - squash(batch.value)
+        error = root_of_value(found) - root_of_value(batch.value)
         return jnp.mean(batch.alive * error**2)
 
     n_columns = config.horizon * config.n_rollouts
@@ -183,7 +183,7 @@ def samples_of(
         the others have weight zero
     """
     before = jax.tree.map(lambda leaf: leaf[:, :-1], kept.states)
-    obs = jax.vmap(jax.vmap(lambda state: hyper.view(problem.observe(state))))(before)
+    obs = jax.vmap(jax.vmap(lambda state: hyper.vec_normalize(problem.observe(state))))(before)
     targets = jax.vmap(lambda plan, tail: _to_go(problem, plan, tail))(kept, tails)
     finite = jnp.isfinite(obs).all((1, 2)) & jnp.isfinite(targets).all(1) & jnp.isfinite(kept.value)
     alive = finite[:, None] & kept.alive[:, :-1]

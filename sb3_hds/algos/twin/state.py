@@ -13,9 +13,9 @@ from jaxtyping import PRNGKeyArray
 from sb3_hds.algos.twin.policy import (
     Actor,
     Networks,
-    Progress,
+    Normalization,
+    TrainingState,
     Value,
-    View,
     output,
     unclipped,
     value_of,
@@ -78,7 +78,7 @@ class Hyperparams(NamedTuple):
     :param sensitivity_weight: 0..1, share that is proportional to the cost of an error in it
     :param averaging: decay of the moving average of policies, per epoch
     :param gradient_steps: regression steps
-    :param view: the environment's own normalisation of observations
+    :param vec_normalize: the environment's own normalisation of observations
     """
 
     params: Params
@@ -91,7 +91,7 @@ class Hyperparams(NamedTuple):
     sensitivity_weight: float
     averaging: float
     gradient_steps: int
-    view: View
+    vec_normalize: Normalization
 
 
 class Samples(NamedTuple):
@@ -138,7 +138,7 @@ class Scales(NamedTuple):
     :param reward_offset: reward that counts as zero
     """
 
-    inside: View
+    inside: Normalization
     reward_scale: jax.Array
     reward_offset: jax.Array
 
@@ -147,14 +147,14 @@ class EpochState(NamedTuple):
     """Everything that an epoch reads and changes."""
 
     networks: Networks
-    progress: Progress
+    progress: TrainingState
     workspace: Workspace
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
 def init_workspace(
-    config: EpochConfig, params: Params, view: View, progress: Progress
-) -> tuple[Workspace, Scales, Progress]:
+    config: EpochConfig, params: Params, vec_normalize: Normalization, progress: TrainingState
+) -> tuple[Workspace, Scales, TrainingState]:
     """
     Draw start states, without samples, and take the scales of observations and rewards from random
     rollouts, so that a new task needs no manual scaling.
@@ -163,7 +163,7 @@ def init_workspace(
     """
     key = jax.random.wrap_key_data(progress.key, impl=GENERATOR)
     key, k_starts, k_plans = jax.random.split(key, 3)
-    n, n_obs, n_act = config.n_rollouts, view.mean.shape[0], len(config.twin.actuators)
+    n, n_obs, n_act = config.n_rollouts, vec_normalize.mean.shape[0], len(config.twin.actuators)
     rows = (config.plan_memory, config.horizon * n)
     empty = jnp.zeros(rows)
     samples = Samples(jnp.zeros((*rows, n_obs)), jnp.zeros((*rows, n_act)), empty, empty, empty)
@@ -173,7 +173,7 @@ def init_workspace(
     problem = Problem(config.twin, params, config.discount)
     search = lambda start, k: best_of_random(problem, start, k, config.horizon, 1)  # noqa: E731
     plans = jax.vmap(search)(starts, jax.random.split(k_plans, n))
-    seen = jax.vmap(jax.vmap(lambda state: view(problem.observe(state))))(plans.states)
+    seen = jax.vmap(jax.vmap(lambda state: vec_normalize(problem.observe(state))))(plans.states)
     offset = _best_reward(plans) if config.discount < 1.0 else jnp.zeros(())
     shortfall = _typical_shortfall(plans, offset, config.discount)
     scale = _TYPICAL_SHORTFALL / jnp.maximum(shortfall, 1e-6)
@@ -211,7 +211,7 @@ def planning_problem(config: EpochConfig, state: EpochState, hyper: Hyperparams)
     """:return: the planning problem with the current networks"""
 
     def roots(obs: Obs) -> jax.Array:
-        seen = state.networks.inside(hyper.view(obs))
+        seen = state.networks.inside(hyper.vec_normalize(obs))
         return output(config.value, state.networks.value, seen)
 
     def of_shortfall(obs: Obs) -> jax.Array:
@@ -230,13 +230,13 @@ def planning_problem(config: EpochConfig, state: EpochState, hyper: Hyperparams)
     )
 
 
-def _input_scales(seen: jax.Array, plans: Plan) -> View:
+def _input_scales(seen: jax.Array, plans: Plan) -> Normalization:
     lived = plans.alive[..., None] & jnp.isfinite(seen)
     count = jnp.maximum(jnp.sum(lived, (0, 1)), 1)
     mean = jnp.sum(jnp.where(lived, seen, 0.0), (0, 1)) / count
     variance = jnp.sum(jnp.where(lived, (seen - mean) ** 2, 0.0), (0, 1)) / count
     scale = jnp.sqrt(variance)
-    return View(mean, jnp.where(scale > 1e-6, scale, 1.0), unclipped())
+    return Normalization(mean, jnp.where(scale > 1e-6, scale, 1.0), unclipped())
 
 
 def _best_reward(plans: Plan) -> jax.Array:

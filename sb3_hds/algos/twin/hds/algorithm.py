@@ -24,7 +24,7 @@ from sb3_hds.algos.twin.hds.correction import (
     names_to_estimate,
 )
 from sb3_hds.algos.twin.hds.recorded_steps import RecordedSteps, Source, data_from
-from sb3_hds.algos.twin.planning_twin import missing_effects, nulls_of, required
+from sb3_hds.algos.twin.planning_twin import missing_effects, nulls_of, require_twin
 from sb3_hds.algos.twin.threads import no_poll, run_in_threads
 from sb3_hds.core import Effect, Params, Trajectories, Twin
 from sb3_hds.core.twin import plant_of
@@ -259,7 +259,7 @@ class HDS(TwinAlgorithm):
             raise TrajectoryError(
                 "Nothing was measured yet. Let the model learn(...) on the real system first."
             )
-        force = force_of(twin := required(self.twin, self.twin_spec))
+        force = force_of(twin := require_twin(self.twin, self.twin_spec))
         silent = {} if force is None else {f"{force[0]}.share": 0.0}
         return diagnose(twin.with_parameters(**self.nominal | silent), data, **arguments)
 
@@ -298,7 +298,7 @@ class HDS(TwinAlgorithm):
 
     def _estimates(self, effect: str) -> bool:
         """:return: whether the twin already has this effect at this location"""
-        known = required(self.twin, self.twin_spec).parameters
+        known = require_twin(self.twin, self.twin_spec).parameters
         return any(name.startswith(f"{effect}.") for name in known)
 
     def _steps_since_change(self) -> int | None:
