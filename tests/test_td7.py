@@ -188,7 +188,7 @@ def test_what_td7_is_loaded_with_counts():
 
 def test_uniform_draws_give_td7_the_gradient_of_prioritised_ones():
     model = small("td7")
-    prioritised = model.update_config()
+    prioritised = model.make_update_config()
     errors = jnp.array([[0.2, 3.0, 5.0, 0.7], [0.9, 1.5, 8.0, 0.1]])
     share = td7_update.priorities_of(prioritised, errors)
     uniform = dataclasses.replace(prioritised, uniform=True)

@@ -92,15 +92,15 @@ class SoftActorCritic(ModelFreeAlgorithm):
         policy_kwargs = {**self.default_policy_kwargs, **(config.policy_kwargs or {})}
         super().construct(dataclasses.replace(config, policy_kwargs=policy_kwargs), **more)
 
-    def update_config(self) -> UpdateConfig:
+    def make_update_config(self) -> UpdateConfig:
         """
         Config of the update: that of SAC for the networks of the policy
-        (``GaussianPolicy.sac_update_config``) with the arguments of this algorithm. Subclasses
+        (``GaussianPolicy.default_update_config``) with the arguments of this algorithm. Subclasses
         replace parts of it.
         """
         config = self.config
         return dataclasses.replace(
-            self.policy.sac_update_config(),
+            self.policy.default_update_config(),
             policy_delay=config.policy_delay,
             target_update_interval=config.target_update_interval,
             learns_ent_coef=isinstance(config.ent_coef, str),
@@ -143,7 +143,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
 
     def _build(self, seed: int) -> None:
         start, device = initial_ent_coef(self.ent_coef), jax_device(self._device_name)
-        config, n_quantiles = self.update_config(), self.policy.n_quantiles
+        config, n_quantiles = self.make_update_config(), self.policy.n_quantiles
         if config.critic_loss is squared_error and n_quantiles > 1:
             raise ValueError(
                 f"{type(self).__name__}(policy_kwargs={{'n_quantiles': {n_quantiles}}}): its "

@@ -157,7 +157,7 @@ class BRO(SoftActorCritic):
     def auto_target_entropy(self) -> float:
         return -0.5 * self.policy.n_act
 
-    def update_config(self) -> UpdateConfig:
+    def make_update_config(self) -> UpdateConfig:
         policy, config = self.policy, self.config
         optimist = OptimisticActor(
             network=MeanShift(policy.actor_body(policy.widths[0]), policy.n_act),
@@ -167,7 +167,7 @@ class BRO(SoftActorCritic):
             multiplier_rate=config.multiplier_rate,
         )
         return dataclasses.replace(
-            super().update_config(),
+            super().make_update_config(),
             target_values=mean_values,
             critic_loss=quantile_huber,
             actor_objective=mean_q,

@@ -39,5 +39,5 @@ class DroQ(SoftActorCritic):
     def __init__(self, config: DroQConfig) -> None:
         self.construct(config)
 
-    def update_config(self) -> UpdateConfig:
-        return dataclasses.replace(super().update_config(), actor_objective=mean_q)
+    def make_update_config(self) -> UpdateConfig:
+        return dataclasses.replace(super().make_update_config(), actor_objective=mean_q)

@@ -210,9 +210,9 @@ class GaussianPolicy(LearningPolicy):
 
     def build_default(self) -> None:
         """Initialise networks for SAC's update, or CrossQ's with batch normalisation."""
-        self.build(self.sac_update_config(), 1.0, 0, jax.devices()[0])
+        self.build(self.default_update_config(), 1.0, 0, jax.devices()[0])
 
-    def sac_update_config(self) -> UpdateConfig:
+    def default_update_config(self) -> UpdateConfig:
         """:return: SAC's update with these networks, or CrossQ's with batch normalisation"""
         return UpdateConfig(
             actor=self.actor_network,
@@ -231,7 +231,7 @@ class GaussianPolicy(LearningPolicy):
         """
         Initialise the networks.
 
-        :param config: of the algorithm
+        :param config: of the algorithm; the policy keeps it as ``update_config``
         :param ent_coef: initial entropy coefficient
         """
         self.update_config = config

@@ -99,8 +99,8 @@ class SimbaSAC(SoftActorCritic):
     def auto_target_entropy(self) -> float:
         return -0.5 * self.policy.n_act
 
-    def update_config(self) -> UpdateConfig:
-        config = super().update_config()
+    def make_update_config(self) -> UpdateConfig:
+        config = super().make_update_config()
         if self.config.clipped_double_q:
             return config
         return dataclasses.replace(config, target_values=mean_values, actor_objective=mean_q)

@@ -51,9 +51,9 @@ class TQC(SoftActorCritic):
     def __init__(self, config: TQCConfig) -> None:
         self.construct(config)
 
-    def update_config(self) -> UpdateConfig:
+    def make_update_config(self) -> UpdateConfig:
         return dataclasses.replace(
-            super().update_config(),
+            super().make_update_config(),
             target_values=TruncatedQuantiles(self.config.top_quantiles_to_drop_per_net),
             critic_loss=quantile_huber,
             actor_objective=mean_q,

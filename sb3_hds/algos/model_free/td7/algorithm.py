@@ -130,7 +130,7 @@ class TD7(ModelFreeAlgorithm):
         self._derived_noise: ActionNoise | None = None
         super().construct(config, **more)
 
-    def update_config(self) -> UpdateConfig:
+    def make_update_config(self) -> UpdateConfig:
         """:return: static configuration of the update"""
         config = self.config
         return UpdateConfig(
@@ -202,7 +202,7 @@ class TD7(ModelFreeAlgorithm):
             )
 
     def _build(self, seed: int) -> None:
-        self.policy.build(self.update_config(), seed, jax_device(self._device_name))
+        self.policy.build(self.make_update_config(), seed, jax_device(self._device_name))
 
     @property
     def kept_by_restarts(self) -> tuple[str, ...]:

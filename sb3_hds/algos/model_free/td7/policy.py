@@ -211,7 +211,7 @@ class TD7Policy(LearningPolicy):
         """
         Initialise the networks.
 
-        :param config: of the algorithm
+        :param config: of the algorithm; the policy keeps it as ``update_config``
         """
         self.update_config = config
         key = jax.random.key(seed, impl=GENERATOR)
