@@ -14,7 +14,7 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_hds import HDS, TD7, CrossQ
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy
 from sb3_hds.algos.model_free.td7.algorithm import TD7Policy
-from sb3_hds.algos.nets.options import finite_leaves
+from sb3_hds.algos.nets.optimizers import finite_leaves
 from sb3_hds.errors import DivergedError
 
 

@@ -25,7 +25,7 @@ from sb3_hds.algos.model_free.sac.networks import SimbaNet
 from sb3_hds.algos.model_free.td7 import update as td7_update
 from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
 from sb3_hds.algos.model_free.update import batches_of
-from sb3_hds.algos.nets.options import TrainState
+from sb3_hds.algos.nets.optimizers import TrainState
 from sb3_hds.errors import EnvironmentMismatchError
 
 CHOICES = spaces.Dict(

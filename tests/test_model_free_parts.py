@@ -21,7 +21,7 @@ from sb3_hds.algos.model_free.sac.tqc import (
     target_by_target,
 )
 from sb3_hds.algos.nets.observations import flattener
-from sb3_hds.algos.nets.options import optimizer_of
+from sb3_hds.algos.nets.optimizers import optimizer_of
 
 
 def test_every_processor_sorts_and_compares_quantiles_alike():

@@ -22,7 +22,8 @@ from sb3_hds.algos.base.files import (
     to_state_dict,
 )
 from sb3_hds.algos.nets.observations import flattener
-from sb3_hds.algos.nets.options import TrainState, by_names, widths
+from sb3_hds.algos.nets.optimizers import TrainState
+from sb3_hds.algos.nets.options import by_names, widths
 from sb3_hds.core.numerics.compilation import GENERATOR
 
 
@@ -215,7 +216,7 @@ class TrainingTensors:
 class LearningPolicy(TensorPolicy):
     """
     Abstract: a policy with a state that updates change, a named tuple of networks with their
-    optimisers (:class:`~sb3_hds.algos.nets.options.TrainState`), a random ``key``, and more.
+    optimisers (:class:`~sb3_hds.algos.nets.optimizers.TrainState`), a random ``key``, and more.
     """
 
     #: further fields of the state that are saved with the weights, not with the training state

@@ -27,7 +27,7 @@ from sb3_hds.algos.base.config import Config, OffPolicyConfig, Rate, between, is
 from sb3_hds.algos.base.policy import LearningPolicy
 from sb3_hds.algos.model_free.update import Source
 from sb3_hds.algos.nets.observations import check_actions, check_observations
-from sb3_hds.algos.nets.options import TrainState, finite_leaves
+from sb3_hds.algos.nets.optimizers import TrainState, finite_leaves
 from sb3_hds.errors import DivergedError, EnvironmentMismatchError
 
 # Logged by updates of the actor, which not every call of ``train`` makes.

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.base.policy import PolicyConfig, TensorPolicy
-from sb3_hds.algos.nets.options import Activation, activation, finite_leaves, widths
+from sb3_hds.algos.nets.optimizers import finite_leaves
+from sb3_hds.algos.nets.options import Activation, activation, widths
 from sb3_hds.core import Obs
 from sb3_hds.core.numerics.compilation import GENERATOR, QUICKEST_COMPILATION
 from sb3_hds.deploy.policy_function import PolicyFunction

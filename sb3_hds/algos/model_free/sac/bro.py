@@ -36,7 +36,8 @@ from sb3_hds.algos.model_free.sac.update import (
     q_values,
 )
 from sb3_hds.algos.model_free.update import Batch
-from sb3_hds.algos.nets.options import Activation, Optimizer, TrainState, Weights
+from sb3_hds.algos.nets.optimizers import Optimizer, TrainState, Weights
+from sb3_hds.algos.nets.options import Activation
 
 # Environment steps at which the authors reset the networks: with the full replay ratio, and with
 # the fast variant's ratio of 2.

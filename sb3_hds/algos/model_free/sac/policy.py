@@ -26,13 +26,8 @@ from sb3_hds.algos.model_free.sac.update import (
     squared_error,
 )
 from sb3_hds.algos.nets.observations import RunningStats, normalize
-from sb3_hds.algos.nets.options import (
-    Activation,
-    Optimizer,
-    Weights,
-    activation,
-    optimizer_of,
-)
+from sb3_hds.algos.nets.optimizers import Optimizer, Weights, optimizer_of
+from sb3_hds.algos.nets.options import Activation, activation
 from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.deploy.policy_function import PolicyFunction
 

@@ -28,7 +28,8 @@ from sb3_hds.algos.model_free.td7.update import (
     init_state,
     q_values,
 )
-from sb3_hds.algos.nets.options import Activation, activation, optimizer_of
+from sb3_hds.algos.nets.optimizers import optimizer_of
+from sb3_hds.algos.nets.options import Activation, activation
 from sb3_hds.core.numerics.compilation import GENERATOR
 from sb3_hds.deploy.policy_function import PolicyFunction
 
