@@ -19,12 +19,12 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import DroQ
+from sb3_hds.algos.model_free.replay import batches_of
 from sb3_hds.algos.model_free.sac import algorithm as soft_actor_critic
 from sb3_hds.algos.model_free.sac import update as off_policy
 from sb3_hds.algos.model_free.sac.networks import SimbaNet
 from sb3_hds.algos.model_free.td7 import update as td7_update
 from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
-from sb3_hds.algos.model_free.update import batches_of
 from sb3_hds.algos.nets.optimizers import TrainState
 from sb3_hds.errors import EnvironmentMismatchError
 

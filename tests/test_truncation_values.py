@@ -15,8 +15,8 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 
 from sb3_hds import algos
 from sb3_hds.algos import learn_compiled
+from sb3_hds.algos.model_free.replay import batches_of
 from sb3_hds.algos.model_free.sac.update import q_values
-from sb3_hds.algos.model_free.update import batches_of
 from sb3_hds.core import State
 from sb3_hds.envs import ConstantReward, TwinEnv
 from sb3_hds.errors import ParameterError

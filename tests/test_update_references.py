@@ -31,10 +31,11 @@ from numpy_networks import (
 from odd_envs import AnySpaces
 
 from sb3_hds import algos
+from sb3_hds.algos.model_free.replay import Batch
 from sb3_hds.algos.model_free.sac.networks import Dropout
 from sb3_hds.algos.model_free.sac.update import Hyperparams, UpdateMetrics, mean_values, update
 from sb3_hds.algos.model_free.td7 import update as td7_update
-from sb3_hds.algos.model_free.update import Batch, zero_metrics
+from sb3_hds.algos.model_free.update import zero_metrics
 from sb3_hds.algos.nets.observations import RunningStats
 
 pytestmark = pytest.mark.usefixtures("x64")

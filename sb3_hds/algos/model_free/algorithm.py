@@ -25,7 +25,7 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_hds.algos.base.algorithm import OffPolicyTensorAlgorithm
 from sb3_hds.algos.base.config import Config, OffPolicyConfig, Rate, between, is_count, schedule_of
 from sb3_hds.algos.base.policy import LearningPolicy
-from sb3_hds.algos.model_free.update import Source
+from sb3_hds.algos.model_free.replay import ReplaySource
 from sb3_hds.algos.nets.observations import check_actions, check_observations
 from sb3_hds.algos.nets.optimizers import TrainState, finite_leaves
 from sb3_hds.errors import DivergedError, EnvironmentMismatchError
@@ -298,10 +298,10 @@ class ModelFreeAlgorithm(OffPolicyTensorAlgorithm):
             buffer.timeouts[buffer.pos - 1, goes_on] = 1.0
 
     @property
-    def replay_source(self) -> Source:
+    def replay_source(self) -> ReplaySource:
         """The replay buffer, and how batches are made of its transitions."""
         normalizer = self.get_vec_normalize_env()
-        return Source(self.replay_buffer, normalizer, self.policy.flatten, self.gamma)
+        return ReplaySource(self.replay_buffer, normalizer, self.policy.flatten, self.gamma)
 
     def learning_rates(self) -> tuple[float, float]:
         """:return: current learning rates of the actor and of the critics"""

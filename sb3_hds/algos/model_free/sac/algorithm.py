@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from sb3_hds.algos.base.checks import jax_device
 from sb3_hds.algos.base.config import between, takes
 from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
+from sb3_hds.algos.model_free.replay import batches_of
 from sb3_hds.algos.model_free.sac.policy import GaussianPolicy, SimbaPolicy
 from sb3_hds.algos.model_free.sac.update import (
     Hyperparams,
@@ -25,7 +26,7 @@ from sb3_hds.algos.model_free.sac.update import (
     squared_error,
     update,
 )
-from sb3_hds.algos.model_free.update import batches_of, zero_metrics
+from sb3_hds.algos.model_free.update import zero_metrics
 
 # Updates per compiled call.
 _MOST_UPDATES = 64

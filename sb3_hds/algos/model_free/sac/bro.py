@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_hds.algos.base.config import takes
+from sb3_hds.algos.model_free.replay import Batch
 from sb3_hds.algos.model_free.sac.algorithm import SACConfig, SoftActorCritic
 from sb3_hds.algos.model_free.sac.networks import (
     ORTHOGONAL,
@@ -35,7 +36,6 @@ from sb3_hds.algos.model_free.sac.update import (
     mean_values,
     q_values,
 )
-from sb3_hds.algos.model_free.update import Batch
 from sb3_hds.algos.nets.optimizers import Optimizer, TrainState, Weights
 from sb3_hds.algos.nets.options import Activation
 

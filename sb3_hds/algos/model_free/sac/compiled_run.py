@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from sb3_hds.algos.model_free.replay import Batch
 from sb3_hds.algos.model_free.sac.networks import ExploringActor, noise_std
 from sb3_hds.algos.model_free.sac.update import (
     Hyperparams,
@@ -22,7 +23,7 @@ from sb3_hds.algos.model_free.sac.update import (
     explore,
     update_once,
 )
-from sb3_hds.algos.model_free.update import Batch, zero_metrics
+from sb3_hds.algos.model_free.update import zero_metrics
 from sb3_hds.algos.nets.observations import RunningStats, normalize
 from sb3_hds.core import Params, State, Twin
 

@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from sb3_hds.algos.model_free.replay import Batch
 from sb3_hds.algos.model_free.sac.networks import Gaussian, log_probability
-from sb3_hds.algos.model_free.update import Batch, UpdateStep, apply_schedule
+from sb3_hds.algos.model_free.update import UpdateStep, apply_schedule
 from sb3_hds.algos.nets.observations import RunningStats, normalize
 from sb3_hds.algos.nets.optimizers import Optimizer, TrainState, Weights
 from sb3_hds.core.numerics.compilation import QUICK_COMPILATION

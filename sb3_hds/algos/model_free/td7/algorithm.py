@@ -15,10 +15,11 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from sb3_hds.algos.base.checks import jax_device
 from sb3_hds.algos.base.config import takes
 from sb3_hds.algos.model_free.algorithm import ModelFreeAlgorithm, ModelFreeConfig
+from sb3_hds.algos.model_free.replay import Batch, batches_of, transitions
 from sb3_hds.algos.model_free.td7.policy import TD7Policy
 from sb3_hds.algos.model_free.td7.prioritized_replay import LapReplayBuffer
 from sb3_hds.algos.model_free.td7.update import UpdateConfig, UpdateMetrics, update
-from sb3_hds.algos.model_free.update import Batch, batches_of, transitions, zero_metrics
+from sb3_hds.algos.model_free.update import zero_metrics
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
