@@ -79,7 +79,7 @@ def test_arguments_and_networks_are_those_of_the_paper(name):
         assert (kept["activation_fn"], kept["qf_activation_fn"]) == ("relu", "elu")
         assert model.learning_rates() == pytest.approx((3e-4, 3e-4))
         return
-    hyper = model.hyper()
+    hyper = model.hyperparams()
     assert (hyper.learning_rate, hyper.target_entropy) == pytest.approx(RATES[name])
     assert hyper.qf_learning_rate == hyper.learning_rate
     actor, critics, n_values, optimizer, arguments = NETWORKS[name]

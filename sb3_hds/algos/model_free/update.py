@@ -36,7 +36,7 @@ def apply_schedule(
     One update: apply its steps in order, each in its interval and with its own random key.
 
     :param state: has a ``key`` and counts its updates in ``n_updates``
-    :param metrics: a named tuple, or a pytree that contains them
+    :param metrics: of the updates before, or a pytree that contains them
     :param steps: each receives the state and the metrics that the previous ones returned
     :return: state and metrics after the update
     """

@@ -153,19 +153,20 @@ class SoftActorCritic(ModelFreeAlgorithm):
         self.policy.build(config, start, seed, device)
 
     def _updates(self, n: int, batch_size: int) -> dict[str, float]:
-        policy, hyper, report, found = self.policy, self.hyper(), {}, zero_metrics(UpdateMetrics)
+        policy, hyper = self.policy, self.hyperparams()
+        report, metrics = {}, zero_metrics(UpdateMetrics)
         for done in range(0, n, _MOST_UPDATES):
             now = min(_MOST_UPDATES, n - done)
             batches = batches_of(self.replay_source, now, batch_size, next_power_of_2(now))
-            state, found = update(
-                policy.update_config, policy.agent_state, batches, now, hyper, found
+            state, metrics = update(
+                policy.update_config, policy.agent_state, batches, now, hyper, metrics
             )
-            found = jax.device_get(found)  # NumPy, as before the first update: compiles once
-            report = {name: float(x) for name, x in found._asdict().items()}
+            metrics = jax.device_get(metrics)  # NumPy, as before the first update: compiles once
+            report = {name: float(value) for name, value in metrics._asdict().items()}
             self._accept(state, report)
         return report
 
-    def hyper(self) -> Hyperparams:
+    def hyperparams(self) -> Hyperparams:
         """:return: the current values of the hyperparameters that may change"""
         rate, qf_rate = self.learning_rates()
         entropy = self.target_entropy

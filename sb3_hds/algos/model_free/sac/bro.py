@@ -279,12 +279,12 @@ class OptimisticActor:
             divergence = jnp.mean(jnp.sum(shift**2 / (2.0 * gaussian.std**2), -1))
             return regularizer * divergence - upper.mean(), divergence
 
-        gradient = jax.value_and_grad(loss, has_aux=True)
-        (_, divergence), slope = gradient(own["actor"].weights["params"])
+        loss_and_gradient = jax.value_and_grad(loss, has_aux=True)
+        (_, divergence), gradient = loss_and_gradient(own["actor"].weights["params"])
         excess = divergence / gaussian.mean.shape[-1] - self.kl_target
         rate = self.multiplier_rate * hyper.learning_rate
         return {
-            "actor": self.optimizer.apply(slope, own["actor"], hyper.learning_rate),
+            "actor": self.optimizer.apply(gradient, own["actor"], hyper.learning_rate),
             "optimism": _adapted(own["optimism"], excess, rate),
             "regularizer": _adapted(own["regularizer"], -excess, rate),
         }
@@ -306,8 +306,8 @@ def _before(log: float) -> Array:
 
 
 def _adapted(multiplier: TrainState, excess: Array, rate: Array | float) -> TrainState:
-    slope = jax.grad(lambda raw: excess * _multiplier(raw))(multiplier.weights["params"])
-    return _MULTIPLIER.apply(slope, multiplier, rate)
+    gradient = jax.grad(lambda raw: excess * _multiplier(raw))(multiplier.weights["params"])
+    return _MULTIPLIER.apply(gradient, multiplier, rate)
 
 
 _MULTIPLIER = Optimizer(optax.adam, (("b1", 0.5),))

@@ -244,7 +244,7 @@ def _rounds_of_calls(
 
 def _hyper_at(model: SoftActorCritic, remaining: float) -> Hyperparams:
     now, model._current_progress_remaining = model._current_progress_remaining, remaining
-    hyper = model.hyper()
+    hyper = model.hyperparams()
     model._current_progress_remaining = now
     return hyper
 

@@ -197,13 +197,16 @@ def update_once(
             obs=normalize(state.obs_stats, batch.obs),
             next_obs=normalize(state.obs_stats, batch.next_obs),
         )
+    critics = partial(update_critics, config, batch, hyper)
     actor = partial(update_actor, config, batch, hyper)
+    target = partial(soft_update, hyper.tau)
     steps = [
-        UpdateStep(("critic",), 1, partial(update_critics, config, batch, hyper)),
+        UpdateStep(("critic",), 1, critics),
         UpdateStep(("actor", "log_ent_coef", "extra"), config.policy_delay, actor),
-        UpdateStep(("target",), config.target_update_interval, partial(soft_update, hyper.tau)),
     ]
-    return apply_schedule(state, metrics, *steps[: 2 if config.joint_pass else 3])
+    if not config.joint_pass:
+        steps.append(UpdateStep(("target",), config.target_update_interval, target))
+    return apply_schedule(state, metrics, *steps)
 
 
 def update_critics(
@@ -238,10 +241,10 @@ def update_critics(
         targets = jax.lax.stop_gradient(reward[:, None] + discount[:, None] * soft)
         return config.critic_loss(values, targets), weights
 
-    gradient = jax.value_and_grad(loss, has_aux=True)
-    (value, weights), slope = gradient(state.critic.weights["params"])
+    loss_and_gradient = jax.value_and_grad(loss, has_aux=True)
+    (value, weights), gradient = loss_and_gradient(state.critic.weights["params"])
     critic = config.qf_optimizer.apply(
-        slope, TrainState(weights, state.critic.optimizer), hyper.qf_learning_rate
+        gradient, TrainState(weights, state.critic.optimizer), hyper.qf_learning_rate
     )
     return (critic,), metrics._replace(critic_loss=value)
 
@@ -277,10 +280,10 @@ def update_actor(
         objective = config.actor_objective(values)
         return jnp.mean(ent_coef * log_prob - objective), (-log_prob.mean(), weights)
 
-    gradient = jax.value_and_grad(loss, has_aux=True)
-    (value, (entropy, weights)), slope = gradient(state.actor.weights["params"])
+    loss_and_gradient = jax.value_and_grad(loss, has_aux=True)
+    (value, (entropy, weights)), gradient = loss_and_gradient(state.actor.weights["params"])
     actor = config.optimizer.apply(
-        slope, TrainState(weights, state.actor.optimizer), hyper.learning_rate
+        gradient, TrainState(weights, state.actor.optimizer), hyper.learning_rate
     )
     log_ent_coef, excess = state.log_ent_coef, entropy - hyper.target_entropy
     linear = config.linear_ent_coef
@@ -290,8 +293,8 @@ def update_actor(
         ent_coef_loss=excess * (ent_coef if linear else log_ent_coef.weights["params"]),
     )
     if config.learns_ent_coef:
-        slope = excess * ent_coef if linear else excess
-        log_ent_coef = config.ent_coef_optimizer.apply(slope, log_ent_coef, hyper.learning_rate)
+        gradient = excess * ent_coef if linear else excess
+        log_ent_coef = config.ent_coef_optimizer.apply(gradient, log_ent_coef, hyper.learning_rate)
     extra = state.extra
     if config.extra is not None:
         now = state._replace(actor=actor, log_ent_coef=log_ent_coef)

@@ -266,21 +266,21 @@ class TD7(ModelFreeAlgorithm):
         """One by one, since the errors of an update change the priorities for the next."""
         buffer: Any = self.replay_buffer
         rates, policy = self.learning_rates(), self.policy
-        metrics, found = {}, zero_metrics(UpdateMetrics)
+        report, metrics = {}, zero_metrics(UpdateMetrics)
         for _ in range(n):
             batch, drawn = self._sample_batch(batch_size)
-            state, found, priorities = update(
-                policy.update_config, policy.agent_state, batch, *rates, found
+            state, metrics, priorities = update(
+                policy.update_config, policy.agent_state, batch, *rates, metrics
             )
-            found = jax.device_get(found)  # NumPy, as before the first update: compiles once
-            metrics = {name: float(value) for name, value in found._asdict().items()}
-            self._accept(state, metrics)
+            metrics = jax.device_get(metrics)  # NumPy, as before the first update: compiles once
+            report = {name: float(value) for name, value in metrics._asdict().items()}
+            self._accept(state, report)
             if drawn is None:
                 continue
             buffer.set_priorities(*drawn, np.asarray(priorities))
             if int(state.n_updates) % self.target_update_interval == 0:
                 buffer.forget_highest()
-        return metrics
+        return report
 
     def _sample_batch(self, batch_size: int) -> tuple[Batch, tuple[np.ndarray, np.ndarray] | None]:
         """:return: a batch, and with priorities the indices of its transitions"""

@@ -170,14 +170,14 @@ def update(
     embedded = embed(config, state.copies.encoder, batch.obs, batch.action)
     critics = partial(_update_critics, config, batch, embedded, qf_learning_rate)
     actor = partial(_update_actor, config, batch, embedded[0], learning_rate)
-    state, found = apply_schedule(
+    state, report = apply_schedule(
         state,
-        _Found(metrics, jnp.zeros(batch.reward.shape)),
+        _Report(metrics, jnp.zeros(batch.reward.shape)),
         UpdateStep(("encoder", "critic", "range"), 1, critics),
         UpdateStep(("actor",), config.policy_delay, actor),
         UpdateStep(("copies", "clip"), config.target_update_interval, _copy),
     )
-    return state, found.metrics, found.priority
+    return state, report.metrics, report.priority
 
 
 def priorities_of(
@@ -202,7 +202,7 @@ def loss_of(config: UpdateConfig, error: Float[Array, "critics batch"]) -> Float
     return jnp.sum(jnp.mean(loss, 1))
 
 
-class _Found(NamedTuple):
+class _Report(NamedTuple):
     """
     :param priority: of the batch's transitions
     """
@@ -217,9 +217,9 @@ def _update_critics(
     embedded: tuple[Array, Array],
     rate: float,
     state: TD7State,
-    found: _Found,
+    report: _Report,
     key: PRNGKeyArray,
-) -> tuple[tuple[TrainState, TrainState, Range], _Found]:
+) -> tuple[tuple[TrainState, TrainState, Range], _Report]:
     """Regress the encoder, and the critics on targets of the copied networks."""
     copies = state.copies
     encoder, encoder_loss = _update_encoder(config, state.encoder, batch, rate)
@@ -240,11 +240,11 @@ def _update_critics(
         error = jnp.abs(value - target)
         return loss_of(config, error), error
 
-    gradient = jax.value_and_grad(loss_and_error, has_aux=True)
-    (loss, error), slope = gradient(state.critic.weights["params"])
-    critic = config.qf_optimizer.apply(slope, state.critic, rate)
-    metrics = found.metrics._replace(critic_loss=loss, encoder_loss=encoder_loss)
-    return (encoder, critic, seen), _Found(metrics, priorities_of(config, error))
+    loss_and_gradient = jax.value_and_grad(loss_and_error, has_aux=True)
+    (loss, error), gradient = loss_and_gradient(state.critic.weights["params"])
+    critic = config.qf_optimizer.apply(gradient, state.critic, rate)
+    metrics = report.metrics._replace(critic_loss=loss, encoder_loss=encoder_loss)
+    return (encoder, critic, seen), _Report(metrics, priorities_of(config, error))
 
 
 def _update_encoder(
@@ -257,8 +257,8 @@ def _update_encoder(
         _, zsa = embed(config, {"params": params}, batch.obs, batch.action)
         return jnp.mean((zsa - jax.lax.stop_gradient(wanted)) ** 2)
 
-    value, slope = jax.value_and_grad(loss)(encoder.weights["params"])
-    return config.qf_optimizer.apply(slope, encoder, rate), value
+    value, gradient = jax.value_and_grad(loss)(encoder.weights["params"])
+    return config.qf_optimizer.apply(gradient, encoder, rate), value
 
 
 def _update_actor(
@@ -267,9 +267,9 @@ def _update_actor(
     zs: Array,
     rate: float,
     state: TD7State,
-    found: _Found,
+    report: _Report,
     _: PRNGKeyArray,
-) -> tuple[tuple[TrainState], _Found]:
+) -> tuple[tuple[TrainState], _Report]:
     """Maximise the mean of the critics over the actor."""
 
     def loss(params: Any) -> Array:
@@ -278,12 +278,14 @@ def _update_actor(
         value = q_values(config, state.critic.weights, batch.obs, action, zs, zsa)
         return -jnp.mean(value)
 
-    value, slope = jax.value_and_grad(loss)(state.actor.weights["params"])
-    actor = config.optimizer.apply(slope, state.actor, rate)
-    return (actor,), found._replace(metrics=found.metrics._replace(actor_loss=value))
+    value, gradient = jax.value_and_grad(loss)(state.actor.weights["params"])
+    actor = config.optimizer.apply(gradient, state.actor, rate)
+    return (actor,), report._replace(metrics=report.metrics._replace(actor_loss=value))
 
 
-def _copy(state: TD7State, found: _Found, _: PRNGKeyArray) -> tuple[tuple[Copies, Range], _Found]:
+def _copy(
+    state: TD7State, report: _Report, _: PRNGKeyArray
+) -> tuple[tuple[Copies, Range], _Report]:
     """Copy networks and the range of targets into those that compute targets."""
     copies = Copies(
         state.encoder.weights,
@@ -291,4 +293,4 @@ def _copy(state: TD7State, found: _Found, _: PRNGKeyArray) -> tuple[tuple[Copies
         state.critic.weights,
         state.copies.encoder,
     )
-    return (copies, state.range), found
+    return (copies, state.range), report
