@@ -240,7 +240,7 @@ def test_bro_starts_afresh_with_its_temperature_and_others_keep_theirs(name, afr
     later = jax.tree.map(lambda x: x + 1, begun)
     model.policy.agent_state = model.policy.agent_state._replace(log_ent_coef=later)
 
-    model._restart(seed=1)
+    model._reset_networks(seed=1)
 
     after = model.policy.agent_state.log_ent_coef
     assert jax.tree.leaves(after) == jax.tree.leaves(begun if afresh else later)

@@ -115,7 +115,7 @@ def with_checkpoint() -> TD7:
     model = assessing()
     model.policy.keep_checkpoint()
     model.best_worst_return = -150.0
-    model._restart(seed=1)
+    model._reset_networks(seed=1)
     return model
 
 

@@ -135,9 +135,9 @@ class OffPolicyTensorAlgorithm(TensorAlgorithm, OffPolicyAlgorithmJax):
         if self.stores_executed:
             buffer_action = executed(self.action_space, buffer_action, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
-        self.stored(new_obs, reward, dones)
+        self.after_step(new_obs, reward, dones)
 
-    def stored(
+    def after_step(
         self, new_obs: np.ndarray | dict[str, np.ndarray], reward: np.ndarray, dones: np.ndarray
     ) -> None:
         """

@@ -128,7 +128,7 @@ class ModelFreeAlgorithm(OffPolicyTensorAlgorithm):
     default_timesteps: ClassVar[int] = 20_000
     policy: LearningPolicy
     #: fields of the policy's state that ``param_resets`` leaves unchanged
-    kept_by_restarts: Any
+    kept_by_resets: Any
     qf_learning_rate: Any
     policy_delay: int
     #: class of the replay buffer that was derived from arguments, if none was passed
@@ -167,10 +167,10 @@ class ModelFreeAlgorithm(OffPolicyTensorAlgorithm):
     def _build(self, seed: int) -> None:
         """Initialise the networks."""
 
-    def _restart(self, seed: int) -> None:
-        """Initialise the networks anew; the fields in ``kept_by_restarts`` stay."""
+    def _reset_networks(self, seed: int) -> None:
+        """Initialise the networks anew; the fields in ``kept_by_resets`` stay."""
         before = self.policy.agent_state
-        kept = {name: getattr(before, name) for name in self.kept_by_restarts}
+        kept = {name: getattr(before, name) for name in self.kept_by_resets}
         self._build(seed)
         self.policy.agent_state = self.policy.agent_state._replace(**kept)
 
@@ -193,7 +193,7 @@ class ModelFreeAlgorithm(OffPolicyTensorAlgorithm):
         resets = self.param_resets or []
         if self.reset_idx < len(resets) and self.num_timesteps >= resets[self.reset_idx]:
             self.reset_idx += 1
-            self._restart(self.network_seed)
+            self._reset_networks(self.network_seed)
         rate, qf_rate = self.learning_rates()
         if gradient_steps > 0 and self.replay_buffer.size() == 0:  # type: ignore[union-attr]
             raise ValueError(
@@ -348,7 +348,7 @@ class ModelFreeAlgorithm(OffPolicyTensorAlgorithm):
         given, self._before = self.qf_learning_rate, None
         derived = self.replay_buffer_class in (None, self._derived_buffer)
         if derived:
-            self._derive_buffer()
+            self._choose_buffer()
         super()._setup_model()
         self.qf_learning_rate = given
         self._derived_buffer = self.replay_buffer_class if derived else None
@@ -360,8 +360,8 @@ class ModelFreeAlgorithm(OffPolicyTensorAlgorithm):
         self.actor: Any = self.policy.actor
         self.critic: Any = self.policy.critic
 
-    def _derive_buffer(self) -> None:
-        """Derive the class again after loading: arguments of ``load`` may have changed it."""
+    def _choose_buffer(self) -> None:
+        """Choose the class, also after loading: arguments of ``load`` may have changed it."""
         if self._derived_buffer is NStepReplayBuffer:
             held = self.replay_buffer_kwargs.items()
             own = {name: value for name, value in held if name not in ("n_steps", "gamma")}

@@ -76,7 +76,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
     }
     policy_family = GaussianPolicy
     # With the entropy coefficient and its optimiser, as in SBX.
-    kept_by_restarts = ("log_ent_coef", "obs_stats", "n_updates")
+    kept_by_resets = ("log_ent_coef", "obs_stats", "n_updates")
     policy: GaussianPolicy
     ent_coef: float | str
     target_entropy: float | str
@@ -182,7 +182,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
             self.policy.keep_noise(n_envs, self.sde_sample_freq)
         return super()._sample_action(learning_starts, action_noise, n_envs)
 
-    def stored(
+    def after_step(
         self, new_obs: np.ndarray | dict[str, np.ndarray], reward: np.ndarray, dones: np.ndarray
     ) -> None:
         self.policy.update_obs_stats(new_obs)

@@ -139,7 +139,7 @@ class BRO(SoftActorCritic):
         "MlpPolicy": BroPolicy,
         "MultiInputPolicy": BroPolicy,
     }
-    kept_by_restarts = ("obs_stats", "n_updates")
+    kept_by_resets = ("obs_stats", "n_updates")
 
     config_class = BROConfig
     default_policy_kwargs = {"n_quantiles": 100}

@@ -106,6 +106,8 @@ class Mlp(nn.Module):
     :param momentum: of the running statistics of batch normalisation
     :param ortho_init: whether kernels start orthogonal with a gain of the square root of 2, rather
         than normal with a gain of 1
+
+    The argument ``train`` of a call concerns batch normalisation: dropout is always on.
     """
 
     net_arch: Sequence[int]

@@ -206,7 +206,7 @@ class TD7(ModelFreeAlgorithm):
         self.policy.build(self.make_update_config(), seed, jax_device(self._device_name))
 
     @property
-    def kept_by_restarts(self) -> tuple[str, ...]:
+    def kept_by_resets(self) -> tuple[str, ...]:
         """With the checkpoint, which acts until an assessment is at least as good."""
         return ("n_updates", "checkpoint") if self.policy.has_checkpoint else ("n_updates",)
 
@@ -292,7 +292,7 @@ class TD7(ModelFreeAlgorithm):
         drawn = buffer.draw(batch_size)
         return Batch(**transitions(self.replay_source, *drawn)), drawn  # type: ignore[arg-type]
 
-    def stored(
+    def after_step(
         self, new_obs: np.ndarray | dict[str, np.ndarray], reward: np.ndarray, dones: np.ndarray
     ) -> None:
         if not self.assesses:
