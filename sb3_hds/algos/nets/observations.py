@@ -43,7 +43,10 @@ class RunningStats(NamedTuple):
 
 
 def normalize(stats: RunningStats, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
-    """:return: standardised observations; unchanged before two were counted"""
+    """
+    :return: standardised observations; unchanged before two were counted, so always in a policy
+        that does not normalise and counts none
+    """
     known = stats.count > 1.0
     std = jnp.sqrt(jnp.where(known, stats.variance, 1.0) + _EPSILON)
     return (obs - jnp.where(known, stats.mean, 0.0)) / std

@@ -179,7 +179,7 @@ class SoftActorCritic(ModelFreeAlgorithm):
         # SB3 has drawn noise matrices at the start of the collection.
         by_steps = self.train_freq.unit == TrainFrequencyUnit.STEP  # type: ignore[union-attr]
         if self.use_sde and self.sde_sample_freq > 0 and by_steps:
-            self.policy.keep_noise(n_envs, self.sde_sample_freq)
+            self.policy.noise_for_step(n_envs, self.sde_sample_freq)
         return super()._sample_action(learning_starts, action_noise, n_envs)
 
     def after_step(

@@ -179,8 +179,7 @@ class GaussianPolicy(LearningPolicy):
             self.actor_network = networks.GaussianActor(body, self.n_act, squash, of_mean, of_std)
         self.critic_network = networks.Critic(self.critic_body(qf), config.n_quantiles, of_mean)
         self.optimizers = config.optimizers()
-        self.discard_noise()
-        self._noise = np.random.default_rng(0)
+        self._draw_noise_by(0)
 
     def actor_body(self, net_arch: Sequence[int]) -> nn.Module:
         return self._mlp(net_arch)
@@ -256,20 +255,20 @@ class GaussianPolicy(LearningPolicy):
         """
         if self.use_sde:
             std = self.get_std()
-            drawn = self._noise.standard_normal((batch_size, *std.shape), np.float32)
+            drawn = self._rng.standard_normal((batch_size, *std.shape), np.float32)
             self.matrices = drawn * std
 
-    def keep_noise(self, batch_size: int, n_steps: int) -> None:
+    def noise_for_step(self, batch_size: int, n_steps: int) -> None:
         """
         To be called at every step: keep noise matrices for ``n_steps`` steps, also if SB3 draws
         others in between.
 
         :param batch_size: number of environments
         """
-        if self._age % n_steps == 0 or len(self._lasting) != batch_size:
+        if self._age % n_steps == 0 or len(self._kept_matrices) != batch_size:
             self.reset_noise(batch_size)
-            self._lasting, self._age = self.matrices, 0
-        self.matrices = self._lasting
+            self._kept_matrices, self._age = self.matrices, 0
+        self.matrices = self._kept_matrices
         self._age += 1
 
     def set_random_seed(self, seed: int) -> None:
@@ -277,12 +276,12 @@ class GaussianPolicy(LearningPolicy):
         self._draw_noise_by(seed)
 
     def _draw_noise_by(self, seed: int) -> None:
-        self._noise = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(seed)
         self.discard_noise()
 
     def discard_noise(self) -> None:
         self.matrices: Any = None
-        self._lasting, self._age = self.matrices, 0
+        self._kept_matrices, self._age = self.matrices, 0
 
     def get_std(self) -> np.ndarray:
         """:return: standard deviation of each entry of the noise matrix; 0 without gSDE"""
@@ -296,21 +295,21 @@ class GaussianPolicy(LearningPolicy):
         if self.normalize_observations:
             stats = state.obs_stats
             scales = np.asarray(stats.mean), np.sqrt(np.asarray(stats.variance))
-        act = partial(_mean, self.actor_network, state.actor.weights, state.obs_stats)
+        act = partial(_deterministic, self.actor_network, state.actor.weights, state.obs_stats)
         return PolicyFunction.without_memory(act, squashed=True, scales=scales)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> np.ndarray:  # type: ignore[override]
         obs, state = self.flatten(observation), self.agent_state
         actor, stats = state.actor.weights, state.obs_stats
         if deterministic:
-            return np.asarray(_mean(self.actor_network, actor, stats, obs))
+            return np.asarray(_deterministic(self.actor_network, actor, stats, obs))
         if self.use_sde:
             if self.matrices is None:
                 self.reset_noise()
             matrices: Any = self.matrices
             noise = matrices if len(matrices) == len(obs) else matrices[:1]
         else:
-            noise = self._noise.standard_normal((len(obs), self.n_act), np.float32)
+            noise = self._rng.standard_normal((len(obs), self.n_act), np.float32)
         return np.asarray(_exploratory(self.update_config, actor, state.extra, stats, obs, noise))
 
 
@@ -360,13 +359,12 @@ def _q_values(
     config: UpdateConfig, weights: Weights, stats: RunningStats, obs: Any, actions: Any
 ) -> jax.Array:
     """Every call draws the same dropout masks."""
-    inside = normalize(stats, obs) if config.normalize_observations else obs
-    values, _ = q_values(config, weights, inside, actions, jax.random.key(0))
+    values, _ = q_values(config, weights, normalize(stats, obs), actions, jax.random.key(0))
     return jnp.mean(values, -1, keepdims=True)
 
 
 @partial(jax.jit, static_argnums=0)
-def _mean(actor: nn.Module, weights: Weights, stats: RunningStats, obs: Any) -> jax.Array:
+def _deterministic(actor: nn.Module, weights: Weights, stats: RunningStats, obs: Any) -> jax.Array:
     return jnp.tanh(forward(actor, weights, normalize(stats, obs))[0].mean)
 
 
