@@ -15,8 +15,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_hds import algos, twins
 from sb3_hds.algos import learn_compiled
-from sb3_hds.algos.model_free.sac import compiled
-from sb3_hds.algos.model_free.sac.compiled_run import run_rounds
+from sb3_hds.algos.model_free.sac.compiled import learn
+from sb3_hds.algos.model_free.sac.compiled.run import run_rounds
 from sb3_hds.envs import twin_of
 from sb3_hds.errors import EnvironmentMismatchError, SeedsDivergedError
 from sb3_hds.wrappers import ActionRateLimit
@@ -86,7 +86,7 @@ def test_seeds_that_diverge_leave_what_the_others_learned(monkeypatch):
     model = small("tqc_jax")
     before = weights_of(model)
     both, _ = learn_compiled(model, 40, seeds=[3, 5])
-    monkeypatch.setattr(compiled, "_diverged", lambda _: np.array([True, False]))
+    monkeypatch.setattr(learn, "_diverged", lambda _: np.array([True, False]))
 
     with pytest.raises(SeedsDivergedError, match=r"with the seeds \[3\].*models") as caught:
         learn_compiled(model, 40, seeds=[3, 5])
@@ -102,7 +102,7 @@ def test_seeds_that_diverge_leave_what_the_others_learned(monkeypatch):
 def test_what_was_learned_before_an_interruption_is_returned(monkeypatch):
     """It comes while a call of the program is waited for, whose state is the next one already."""
     waits = Mock(side_effect=[np.array([False]), KeyboardInterrupt])
-    monkeypatch.setattr(compiled, "_diverged", waits)
+    monkeypatch.setattr(learn, "_diverged", waits)
 
     with pytest.warns(UserWarning, match="Interrupted after 2000 of 3000 steps"):
         (model,), (episodes,) = learn_compiled(small("tqc_jax", buffer_size=5_000), 3_000)

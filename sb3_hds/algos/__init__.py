@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from sb3_hds.algos.base.executed_actions import ExecutedDictReplayBuffer, ExecutedReplayBuffer
     from sb3_hds.algos.base.policy_file import load_policy
     from sb3_hds.algos.base.threaded_training import TrainBeside
-    from sb3_hds.algos.model_free.sac.algorithm import GSDESAC
     from sb3_hds.algos.model_free.sac.bro import BRO
-    from sb3_hds.algos.model_free.sac.compiled import Episodes, learn_compiled
+    from sb3_hds.algos.model_free.sac.compiled.learn import Episodes, learn_compiled
     from sb3_hds.algos.model_free.sac.crossq import CrossQ
     from sb3_hds.algos.model_free.sac.droq import DroQ
+    from sb3_hds.algos.model_free.sac.gsde_sac import GSDESAC
     from sb3_hds.algos.model_free.sac.policy import GaussianPolicy
     from sb3_hds.algos.model_free.sac.simba import SimbaSAC
     from sb3_hds.algos.model_free.sac.tqc import TQC
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 # Public names besides algorithms and policies.
 _OTHERS = {
-    "Episodes": "model_free.sac.compiled",
+    "Episodes": "model_free.sac.compiled.learn",
     "ExecutedDictReplayBuffer": "base.executed_actions",
     "ExecutedReplayBuffer": "base.executed_actions",
     "LapReplayBuffer": "model_free.td7.prioritized_replay",
     "SumTree": "model_free.td7.prioritized_replay",
     "TrainBeside": "base.threaded_training",
-    "learn_compiled": "model_free.sac.compiled",
+    "learn_compiled": "model_free.sac.compiled.learn",
     "load_policy": "base.policy_file",
 }
 _MODULES = registry.MODULES | _OTHERS

@@ -34,7 +34,7 @@ _GAUSSIAN = {"GaussianPolicy": _SAC_POLICY, "SimbaPolicy": _SAC_POLICY}
 ALGORITHMS: dict[str, Entry] = {
     "pods": Entry("PODS", "twin.pods", _TWIN, "planner"),
     "hds": Entry("HDS", "twin.hds.algorithm", _TWIN, "planner"),
-    "gsde_sac": Entry("GSDESAC", "model_free.sac.algorithm", _GAUSSIAN, "gsde"),
+    "gsde_sac": Entry("GSDESAC", "model_free.sac.gsde_sac", _GAUSSIAN, "gsde"),
     "droq": Entry("DroQ", "model_free.sac.droq", _GAUSSIAN, "sac"),
     "crossq_jax": Entry(
         "CrossQ", "model_free.sac.crossq", {"CrossQPolicy": "model_free.sac.crossq"}, "model_free"

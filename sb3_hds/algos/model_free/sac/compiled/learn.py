@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from sb3_hds.algos.base.config import is_count
 from sb3_hds.algos.model_free.sac.algorithm import SoftActorCritic, next_power_of_2
-from sb3_hds.algos.model_free.sac.compiled_run import (
+from sb3_hds.algos.model_free.sac.compiled.run import (
     Loop,
     Round,
     Run,

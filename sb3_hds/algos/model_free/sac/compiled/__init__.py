@@ -1,0 +1,1 @@
+"""Learning of the SAC family with several seeds in one compiled program."""
