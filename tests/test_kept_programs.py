@@ -12,7 +12,7 @@ import pytest
 from cases import each
 
 from sb3_hds.core.numerics import compilation
-from sb3_hds.core.numerics.compilation import Programs, keep_programs
+from sb3_hds.core.numerics.compilation import Programs, cache_compiled_programs
 
 SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 OF_USERS = ("JAX_COMPILATION_CACHE_DIR", "SB3_HDS_CACHE", "XDG_CACHE_HOME")
@@ -30,8 +30,8 @@ print(json.dumps([counts["cache_hits"], counts["cache_misses"]]))
 #: a program of JAX's own comes first: what is compiled earlier does not keep the cache off
 PLAIN = """
 jax.numpy.zeros(3).block_until_ready()
-from sb3_hds.core.numerics.compilation import keep_programs
-keep_programs()
+from sb3_hds.core.numerics.compilation import cache_compiled_programs
+cache_compiled_programs()
 assert jax.jit(lambda x: 2.0 * x + 1.0)(3.0) == 7.0
 """
 CONSTRUCTED = """
@@ -78,8 +78,10 @@ def test_programs_are_kept_where_the_user_wants_them(
         monkeypatch.setenv(name, value.format(tmp=tmp_path))
     expected = expected and expected.format(tmp=tmp_path)
 
-    assert keep_programs() == (expected and Path(expected))
-    assert keep_programs() == (expected and Path(expected)), "a second call changes nothing"
+    assert cache_compiled_programs() == (expected and Path(expected))
+    assert cache_compiled_programs() == (expected and Path(expected)), (
+        "a second call changes nothing"
+    )
 
     assert jax.config.values["jax_compilation_cache_dir"] == expected
     seconds = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
@@ -91,7 +93,7 @@ def test_a_folder_that_jax_was_given_stays(folder, fresh_settings, monkeypatch, 
     monkeypatch.setenv("SB3_HDS_CACHE", str(tmp_path))
     jax.config.update("jax_compilation_cache_dir", folder)
 
-    assert keep_programs() is None
+    assert cache_compiled_programs() is None
     assert jax.config.values["jax_compilation_cache_dir"] == folder
 
 
@@ -99,7 +101,7 @@ def test_nothing_is_cached_where_jax_caches_nothing(fresh_settings, monkeypatch,
     monkeypatch.setenv("SB3_HDS_CACHE", str(tmp_path))
     jax.config.update("jax_enable_compilation_cache", False)
     try:
-        assert keep_programs() is None
+        assert cache_compiled_programs() is None
     finally:
         jax.config.update("jax_enable_compilation_cache", True)
     assert jax.config.values["jax_compilation_cache_dir"] is None
@@ -109,7 +111,7 @@ def test_how_long_a_program_must_take_is_the_users_to_say(fresh_settings, monkey
     monkeypatch.setenv("SB3_HDS_CACHE", str(tmp_path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 5.0)
 
-    assert keep_programs() == tmp_path
+    assert cache_compiled_programs() == tmp_path
     assert jax.config.values["jax_persistent_cache_min_compile_time_secs"] == 5.0
 
 
@@ -120,7 +122,7 @@ def test_with_an_unknown_cache_of_jax_nothing_is_cached(fresh_settings, monkeypa
     monkeypatch.delattr(compilation_cache, "get_file_cache")
     compilation._hook_into_jax.cache_clear()
     try:
-        assert keep_programs() is None
+        assert cache_compiled_programs() is None
     finally:
         compilation._hook_into_jax.cache_clear()
     assert jax.config.values["jax_compilation_cache_dir"] is None

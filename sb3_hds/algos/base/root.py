@@ -28,7 +28,7 @@ from sb3_hds.algos.base.config import Config, arguments_of, check_known
 from sb3_hds.algos.base.files import damage_reported, name_of, refuse_damaged, write_whole
 from sb3_hds.algos.base.policy_file import described
 from sb3_hds.algos.nets.options import by_names
-from sb3_hds.core.numerics.compilation import keep_programs
+from sb3_hds.core.numerics.compilation import cache_compiled_programs
 from sb3_hds.errors import EnvironmentMismatchError
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class TensorAlgorithm(BaseAlgorithm):
 
         :param more: fixed arguments of SB3's constructor
         """
-        keep_programs()
+        cache_compiled_programs()
         policy, env = policy_and_env(
             type(self), config.policy, config.env, self.check_observations, config.monitor_wrapper
         )

@@ -52,7 +52,7 @@ _DIR, _SECONDS, _USUAL_SECONDS = (
 _folders: set[str] = set()
 
 
-def keep_programs() -> Path | None:
+def cache_compiled_programs() -> Path | None:
     """
     Cache what JAX compiles in ``~/.cache/sb3_hds/xla`` from now on.
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from sb3_hds.core import Effect, Trajectories, Twin
 from sb3_hds.core.belief import BeliefTwin
 from sb3_hds.core.contract import check_methods
-from sb3_hds.core.numerics.compilation import keep_programs
+from sb3_hds.core.numerics.compilation import cache_compiled_programs
 from sb3_hds.effects import ALL, effect_named
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.diagnosis.pipeline import EFFORTS, Inquiry
@@ -67,7 +67,7 @@ def diagnose(
         )
     twin = twin.member(0) if isinstance(twin, BeliefTwin) else twin
     check_methods(twin)
-    keep_programs()
+    cache_compiled_programs()
     check_fits(twin, data)
     if budget not in EFFORTS:
         raise CalibrationError(f"budget must be 'full' or 'quick', got {budget!r}.")

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.contract import check_methods
-from sb3_hds.core.numerics.compilation import keep_programs
+from sb3_hds.core.numerics.compilation import cache_compiled_programs
 from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
@@ -92,7 +92,7 @@ def calibrate(
     :raises TwinError: for a twin whose methods do not return what they have to
     """
     check_methods(twin)
-    keep_programs()
+    cache_compiled_programs()
     wanted = tie(twin, free_names(twin, free), tied or {})
     check_fits(twin, data)
     if loss not in ("huber", "linear"):
