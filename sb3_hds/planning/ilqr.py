@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from sb3_hds.core import Scalar, State, solve_spd
 from sb3_hds.planning.expansion import Expansion, expand
 from sb3_hds.planning.line_search import choose, climb, step_sizes
-from sb3_hds.planning.problem import Control, Controls, Plan, Problem, roll_out, simulated
+from sb3_hds.planning.problem import Control, Controls, Plan, Problem, as_plan, roll_out
 
 _LEAST_REGULARISATION = 1e-6
 # Smallest curvature along a control direction, in units of the scaled objective.
@@ -116,7 +116,7 @@ def ilqr(
     :param key: needed with a temperature
     :return: the plan, and the gains of the last iteration, which belong to the plan before it
     """
-    first = simulated(problem, start, first)
+    first = as_plan(problem, start, first)
     dtype = first.controls.dtype
     steps = jnp.array(step_sizes(n_step_sizes), dtype)
     keys = jnp.arange(n_iterations) if key is None else jax.random.split(key, n_iterations)
@@ -126,7 +126,9 @@ def ilqr(
         gains = solve_backward(expand(problem, plan), plan.controls, regularisation)
         finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in gains]))
         gains = jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gains)
-        candidates = jax.vmap(lambda step: _follow(problem, start, plan, gains, step))(steps)
+        candidates = jax.vmap(
+            lambda step: _roll_out_with_feedback(problem, start, plan, gains, step)
+        )(steps)
         best = choose(candidates.value, temperature, None if key is None else draw)
         factor = jnp.where(best == 0, 10.0, 0.1).astype(dtype)
         regularisation = jnp.clip(regularisation * factor, _LEAST_REGULARISATION, 1e6)
@@ -183,7 +185,9 @@ def newton_direction(problem: Problem, plan: Plan) -> Controls:
     return jnp.where(jnp.all(jnp.isfinite(direction)), direction, 0.0)
 
 
-def _follow(problem: Problem, start: State, plan: Plan, gains: Gains, step: Scalar) -> Plan:
+def _roll_out_with_feedback(
+    problem: Problem, start: State, plan: Plan, gains: Gains, step: Scalar
+) -> Plan:
     """Roll out the plan with ``step`` times its change, and feedback; 0 changes nothing."""
     reference = jax.tree.map(lambda leaf: leaf[:-1], plan.states)
     feedback = jnp.where(step > 0.0, gains.feedback, 0.0)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sb3_hds.core import Scalar, State
 from sb3_hds.planning.expansion import Expansion, expand
-from sb3_hds.planning.problem import Controls, Plan, Problem, simulate, simulated
+from sb3_hds.planning.problem import Controls, Plan, Problem, as_plan, simulate
 
 
 def step_sizes(n: int, smallest: float = 0.015) -> tuple[float, ...]:
@@ -63,7 +63,7 @@ def climb(
     :param n_step_sizes: candidates of each line search, "no change" and steps from 1 down to 5e-4
     :return: the last plan; without temperature never worse than the start
     """
-    first = simulated(problem, start, first)
+    first = as_plan(problem, start, first)
     steps = jnp.array(step_sizes(n_step_sizes, 5e-4), first.controls.dtype)
     draws = jnp.arange(n_iterations) if key is None else jax.random.split(key, n_iterations)
 

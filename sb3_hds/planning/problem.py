@@ -116,7 +116,7 @@ def simulate(problem: Problem, start: State, controls: Controls) -> Plan:
     return roll_out(problem, start, lambda _, control: control, controls, controls.shape[0])
 
 
-def simulated(problem: Problem, start: State, first: Controls | Plan) -> Plan:
+def as_plan(problem: Problem, start: State, first: Controls | Plan) -> Plan:
     """:return: the plan of the controls from ``start``; a plan is returned unchanged"""
     return first if isinstance(first, Plan) else simulate(problem, start, first)
 
