@@ -273,6 +273,10 @@ class Twin(abc.ABC):
             "parameters": dict(self.values),
         }
 
+    def same_values(self, other: "Twin") -> bool:
+        """:return: whether both are equal, which ignores values, and have the same values, too"""
+        return self == other and self.values == other.values
+
     def structure(self) -> tuple[Any, ...]:
         """The key of the compiled program: everything but the values of parameters."""
         return (type(self), self.dt, self.substeps, *(getattr(self, name) for name in self.options))

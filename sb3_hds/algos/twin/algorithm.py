@@ -252,7 +252,7 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
             check_methods(twin)
             check_reward(twin)
             twin = self._prepare_twin(twin)
-            if self.twin is not None and (twin != self.twin or twin.values != self.twin.values):
+            if self.twin is not None and not twin.same_values(self.twin):
                 self._workspace = None
         self.twin = twin
 

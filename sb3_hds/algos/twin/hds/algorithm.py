@@ -228,9 +228,10 @@ class HDS(TwinAlgorithm):
         self._refitted_at = self.real_timesteps
         if found.residual is not None:
             self._steps_at_force = n_steps
+        # Equality ignores values: with another structure, programs are compiled again.
         if found.twin != self.twin:
             self._workspace = None
-        if found.twin != self.twin or found.twin.values != self.twin.values:
+        if not found.twin.same_values(self.twin):
             self.twin_spec = found.twin.to_spec()
         self.twin, self.model_beta = found.twin, found.beta
         self.nominal |= found.attached
