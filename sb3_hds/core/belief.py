@@ -52,7 +52,7 @@ class BeliefTwin(Layer):
         origin = np.zeros(len(draws), int) if origin is None else np.asarray(origin, int)
         _check(base, draws, origin, answers, weights)
         self.base = base
-        self._mirror(base)
+        self._copy_declarations(base)
         own = dict(zip(base.parameters, draws.T, strict=True))
         self.varied = tuple(name for name, column in own.items() if np.ptp(column) > 0.0)
         shared = [name for name in own if name not in self.varied]

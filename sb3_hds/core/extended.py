@@ -56,7 +56,7 @@ class ExtendedTwin(Layer):
                 f"An effect can be attached once at each place; {', '.join(repeated)} was given "
                 "more than once."
             )
-        self._mirror(base)
+        self._copy_declarations(base)
         for a in self.attached:
             for name, parameter in a.effect.parameters.items():
                 full_name = f"{a.key}.{name}"

@@ -79,7 +79,7 @@ class TransformedTwin(Layer):
             )
         self.base, self.observation, self.action = base, observation, action
         self.stateful = stateful
-        self._mirror(base)
+        self._copy_declarations(base)
         if stateful is not None:
             self._below = Signals(base.actuators, base.channels)
             self._key = f"{stateful.name} at {_depth(base)}"

@@ -304,18 +304,6 @@ class Twin(abc.ABC):
                 f"there are none, got {declared!r}."
             )
 
-    def _mirror(self, base: "Twin") -> None:
-        """Copy the attributes that a wrapping twin shares with ``base``."""
-        self.name, self.env_id = base.name, base.env_id
-        self.dt, self.substeps = base.dt, base.substeps
-        self.joints, self.actuators, self.channels = base.joints, base.actuators, base.channels
-        self.max_episode_steps = base.max_episode_steps
-        self.differentiability = base.differentiability
-        self.reward_has_gradient = base.reward_has_gradient
-        self.parameters, self.values = base.parameters, dict(base.values)
-        self.known_parameters, self.native_effects = base.known_parameters, base.native_effects
-        self.tensors = dict(base.tensors)
-
     def _set(self, values: Mapping[str, Any]) -> None:
         for name, value in values.items():
             if name not in self.parameters:
@@ -374,6 +362,18 @@ class Layer(Twin):
 
     def sketch(self, state: State, params: Params) -> Float[Array, "points 2"]:
         return self.base.sketch(self.inner_state(state), self.inner_params(state, params))
+
+    def _copy_declarations(self, base: Twin) -> None:
+        """Copy what this layer shares with the twin inside it."""
+        self.name, self.env_id = base.name, base.env_id
+        self.dt, self.substeps = base.dt, base.substeps
+        self.joints, self.actuators, self.channels = base.joints, base.actuators, base.channels
+        self.max_episode_steps = base.max_episode_steps
+        self.differentiability = base.differentiability
+        self.reward_has_gradient = base.reward_has_gradient
+        self.parameters, self.values = base.parameters, dict(base.values)
+        self.known_parameters, self.native_effects = base.known_parameters, base.native_effects
+        self.tensors = dict(base.tensors)
 
     def _base_with_values(self) -> Twin:
         """The inner twin with the values and tensors that this layer has for it now."""
