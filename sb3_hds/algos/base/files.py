@@ -13,7 +13,6 @@ import io
 import json
 import os
 import pickle
-import secrets
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,6 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 import torch as th
 
+from sb3_hds.core.trajectories.storage import writing
+
 
 def write_whole(
     path: str | os.PathLike[str] | io.BufferedIOBase,
@@ -31,8 +32,7 @@ def write_whole(
     write: Callable[[io.BufferedIOBase], None],
 ) -> None:
     """
-    Write atomically: under a temporary name in the same folder, then rename. Also after the process
-    was killed, there is either the complete new file or the older one.
+    Write atomically, as :func:`~sb3_hds.core.trajectories.storage.writing` does.
 
     :param path: of the file, whose folders are made; an open file is written to directly
     :param suffix: without a dot, appended to a name that has none, as SB3 does
@@ -44,16 +44,10 @@ def write_whole(
         return
     target = Path(path)
     target = target if target.suffix else target.with_name(f"{target.name}.{suffix}")
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.ExitStack() as stack:
-            stack.callback(_remove, temporary)
-            with temporary.open("xb") as file:
-                write(file)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, target)
+        with writing(target, durable=True) as file:
+            write(file)
     except OSError as error:
         reason = (
             f"'{target}' could not be written: {error.strerror or error}. An older file there is "
@@ -173,11 +167,6 @@ def from_state_dict(tree: Any, tensors: dict[str, th.Tensor], strict: bool = Tru
         value = tensors[name].cpu().numpy() if name in tensors else leaf
         values.append(_where(leaf, value))
     return jax.tree_util.tree_unflatten(structure, values)
-
-
-def _remove(file: Path) -> None:
-    with contextlib.suppress(OSError):
-        file.unlink()
 
 
 def _where(leaf: Any, value: Any) -> Any:

@@ -1,12 +1,13 @@
 """Files: atomic writes, arrays without pickle, and the reader of logs."""
 
+import contextlib
 import io
 import os
 import secrets
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -47,26 +48,42 @@ def check_target(path: str | os.PathLike[str]) -> None:
         raise IsADirectoryError(f"{target} is a folder. Name a file.")
 
 
-def write_bytes(path: str | os.PathLike[str], content: bytes, *, durable: bool = False) -> Path:
+@contextlib.contextmanager
+def writing(target: Path, *, durable: bool) -> Iterator[io.BufferedWriter]:
     """
-    Write under a temporary name in the same folder, then rename: a reader never sees half a file.
+    Write atomically: under a temporary name in the same folder, renamed at the end. Also after the
+    process was killed, there is either the complete new file or the older one.
 
-    :param path: a file of that name is replaced
+    :param target: a file of that name is replaced
     :param durable: flush it to the disk before renaming, so that it survives a loss of power
-    :return: the path of the file
+    :return: the open file
     :raises OSError: if the file cannot be written; an older file there is left as it was
     """
-    target = Path(path)
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
     try:
         with temporary.open("xb") as file:
-            file.write(content)
+            yield file
             if durable:
                 file.flush()
                 os.fsync(file.fileno())
         temporary.replace(target)
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def write_bytes(path: str | os.PathLike[str], content: bytes, *, durable: bool = False) -> Path:
+    """
+    Write a file as :func:`writing` does.
+
+    :param path: a file of that name is replaced
+    :param durable: whether it survives a loss of power
+    :return: the path of the file
+    :raises OSError: if the file cannot be written; an older file there is left as it was
+    """
+    target = Path(path)
+    with writing(target, durable=durable) as file:
+        file.write(content)
     return target
 
 
