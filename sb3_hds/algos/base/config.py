@@ -124,9 +124,9 @@ class Config:
     @classmethod
     def of(cls, model: Any) -> Any:
         """:return: the current values of the arguments, from the model's attributes, checked"""
-        held = vars(model)
-        names = [name for name in arguments_of(cls) if name in held and name not in _OBJECTS]
-        return cls(**{name: held[name] for name in names})
+        attributes = vars(model)
+        names = [name for name in arguments_of(cls) if name in attributes and name not in _OBJECTS]
+        return cls(**{name: attributes[name] for name in names})
 
     def __post_init__(self) -> None:
         """
