@@ -75,7 +75,7 @@ def test_a_twin_that_is_exact_is_left_alone():
     twin = twins.make("PendulumReal")
     found = corrected(twin, measured(twin))
 
-    assert found.twin is twin and not found.changed and found.fit is None and not found.attached
+    assert found.twin is twin and not found.replan and found.fit is None and not found.attached
     assert found.error_twin < 1e-4
     line = {"model/error_twin": found.error_twin, "model/beta": 0.0, "model/forgotten": 0}
     assert recorded(found) == line
@@ -88,7 +88,7 @@ def test_a_twin_that_is_exact_is_left_alone():
 def test_parameters_are_corrected_and_suspects_that_explain_nothing_are_removed(found):
     line = recorded(found)
 
-    assert found.changed and found.error_calibrated < 0.5 * found.error_twin
+    assert found.replan and found.error_calibrated < 0.5 * found.error_twin
     assert inertia(found.twin) == pytest.approx(1.3 / 3.0, rel=0.02)
     assert found.twin.values["damping"] == pytest.approx(0.1, rel=0.1)
     assert found.fit["action_delay.torque.delay"] and not found.attached
@@ -101,7 +101,7 @@ def test_parameters_are_corrected_and_suspects_that_explain_nothing_are_removed(
 def test_once_corrected_nothing_changes_any_more(found, heavier):
     own = wishes(twins.make("PendulumReal"))
     again = correct(found.twin, heavier, own, 0.0, learn_force=False, n_new=1000)
-    assert not again.changed and again.error_calibrated <= found.error_calibrated * 1.001
+    assert not again.replan and again.error_calibrated <= found.error_calibrated * 1.001
 
 
 def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one():
@@ -119,7 +119,7 @@ def test_a_system_that_friction_holds_fast_is_not_taken_for_a_heavier_one():
     line = recorded(found)
 
     assert found.fit["mass"].estimate > 1.5 and line["model/mass"] == 1.0
-    assert found.twin == twins.make("PendulumReal") and not found.changed
+    assert found.twin == twins.make("PendulumReal") and not found.replan
     assert not [key for key in line if key.endswith(("_low", "_high"))]
 
 
@@ -160,7 +160,7 @@ def test_an_attached_force_that_no_longer_helps_is_switched_off(heavier):
 
     ((key, _),) = [force_of(found.twin)]
     assert found.beta == 0.0 and found.twin.values[f"{key}.share"] == 0.0
-    assert found.error_hybrid > 1.5 * found.error_calibrated and found.changed
+    assert found.error_hybrid > 1.5 * found.error_calibrated and found.replan
 
 
 def test_data_from_before_a_change_are_forgotten():
@@ -171,7 +171,7 @@ def test_data_from_before_a_change_are_forgotten():
     found = corrected(twins.make("PendulumReal"), both, n_new=after.n_steps)
     mixed = corrected(twins.make("PendulumReal"), both, n_new=both.n_steps)
 
-    assert found.change is not None and mixed.change is None
+    assert found.change_point is not None and mixed.change_point is None
     assert found.error_calibrated < 1e-3 < mixed.error_calibrated
 
 
@@ -183,7 +183,7 @@ def test_a_wrong_twin_is_seen_though_the_system_mostly_rests():
 
     found = corrected(twins.make("PendulumReal"), Trajectories.concatenate([resting, moving]))
 
-    assert found.changed and found.error_calibrated < 0.1 * found.error_twin
+    assert found.replan and found.error_calibrated < 0.1 * found.error_twin
 
 
 @pytest.mark.expensive
@@ -320,7 +320,7 @@ def columns(model):
 def test_a_file_corrects_the_model_and_travels_with_it(tmp_path, heavier, monkeypatch, no_planning):
     def rubs(twin, data, *_, **__):
         np.testing.assert_array_equal(data.obs, heavier.obs)
-        return Correction(twin.with_parameters(damping=0.1), 0.0, changed=True)
+        return Correction(twin.with_parameters(damping=0.1), 0.0, replan=True)
 
     monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm.correct", rubs)
     path = heavier.save(tmp_path / "log")
@@ -354,8 +354,10 @@ def test_what_counts_since_a_change_is_remembered_in_real_steps(monkeypatch, no_
 
     def changed_once(twin, data, *_, change, **__):
         counted.append((data.n_steps, change))
-        found = Correction(twin, 0.0, changed=True, attached={"friction": 0.0})
-        return dataclasses.replace(found, change=ChangePoint(15, 0) if len(counted) == 2 else None)
+        found = Correction(twin, 0.0, replan=True, attached={"friction": 0.0})
+        return dataclasses.replace(
+            found, change_point=ChangePoint(15, 0) if len(counted) == 2 else None
+        )
 
     monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm.correct", changed_once)
     monkeypatch.setattr("sb3_hds.algos.twin.hds.algorithm._REPLAN_EPOCHS", 2)
@@ -381,8 +383,8 @@ def test_after_a_change_the_force_is_learned_again_once_the_data_since_have_doub
         return Correction(
             twin,
             0.0,
-            changed=False,
-            change=ChangePoint(n_new, 0) if len(learns) == 2 else None,
+            replan=False,
+            change_point=ChangePoint(n_new, 0) if len(learns) == 2 else None,
             residual=force if learn_force else None,
         )
 
@@ -401,7 +403,7 @@ def test_what_acts_after_a_comparison_acts_until_the_next_one(monkeypatch):
 
     def changed(twin, *_, **__):
         learns.append(True)
-        return Correction(twin, 0.0, changed=len(learns) == 2)
+        return Correction(twin, 0.0, replan=len(learns) == 2)
 
     def noted(self, gradient_steps):
         usual(self, gradient_steps)

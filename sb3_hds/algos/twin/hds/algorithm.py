@@ -23,12 +23,13 @@ from sb3_hds.algos.twin.hds.correction import (
     correct,
     names_to_estimate,
 )
-from sb3_hds.algos.twin.hds.recorded_steps import RecordedSteps, Source, data_from
+from sb3_hds.algos.twin.hds.recorded_steps import MeasuredSteps, RecordedSteps, data_from
+from sb3_hds.algos.twin.hds.windows import force_share_name, no_force
 from sb3_hds.algos.twin.planning_twin import missing_effects, nulls_of, require_twin
 from sb3_hds.algos.twin.threads import no_poll, run_in_threads
 from sb3_hds.core import Effect, Params, Trajectories, Twin
 from sb3_hds.core.twin import plant_of
-from sb3_hds.effects import ALL, KNOWN, SignFlip, effect_named, force_of, reversed_joint
+from sb3_hds.effects import ALL, KNOWN, SignFlip, effect_named, reversed_joint
 from sb3_hds.errors import TrajectoryError
 from sb3_hds.sysid import Diagnosis, Finding, diagnose
 
@@ -220,32 +221,36 @@ class HDS(TwinAlgorithm):
             n_new=self.real_timesteps - self._refitted_at,
             change=None if n_counted is None else ChangePoint(n_counted, self._changed_in),
         )
-        found = by_data() if self.poll is no_poll else run_in_threads([by_data], self.poll)[0]
-        if found.change is not None:
-            n_steps = min(n_steps, found.change.n_steps)
-            self._changed_at = self.real_timesteps - found.change.n_steps
-            self._changed_in, self._steps_at_force = found.change.recording, 0
+        correction = by_data() if self.poll is no_poll else run_in_threads([by_data], self.poll)[0]
+        if correction.change_point is not None:
+            since, self._changed_in = correction.change_point
+            self._changed_at, self._steps_at_force = self.real_timesteps - since, 0
+            n_steps = min(n_steps, since)
         self._refitted_at = self.real_timesteps
-        if found.residual is not None:
+        if correction.residual is not None:
             self._steps_at_force = n_steps
         # Equality ignores values: with another structure, programs are compiled again.
-        if found.twin != self.twin:
+        if correction.twin != self.twin:
             self._workspace = None
-        if not found.twin.same_values(self.twin):
-            self.twin_spec = found.twin.to_spec()
-        self.twin, self.model_beta = found.twin, found.beta
-        self.nominal |= found.attached
-        values, intervals = found.log()
+        if not correction.twin.same_values(self.twin):
+            self.twin_spec = correction.twin.to_spec()
+        self.twin, self.model_beta = correction.twin, correction.beta
+        self.nominal |= correction.attached
+        values, intervals = correction.log()
         for name, value in values.items():
             self.logger.record(name, value)
         for name, value in intervals.items():
             self.logger.record(name, value, exclude="stdout")
-        if found.changed and gradient_steps:
-            for remaining in range(_REPLAN_EPOCHS, 0, -1):
-                self._replanning = remaining
-                super().train(gradient_steps, self.batch_size)
-            self._replanning = 0
-        return found
+        if correction.replan and gradient_steps:
+            self._plan_again(gradient_steps)
+        return correction
+
+    def _plan_again(self, gradient_steps: int) -> None:
+        """Planning epochs in a model that has changed, before the next real step."""
+        for remaining in range(_REPLAN_EPOCHS, 0, -1):
+            self._replanning = remaining
+            super().train(gradient_steps, self.batch_size)
+        self._replanning = 0
 
     def diagnose(self, **arguments: Any) -> Diagnosis:
         """
@@ -260,9 +265,8 @@ class HDS(TwinAlgorithm):
             raise TrajectoryError(
                 "Nothing was measured yet. Let the model learn(...) on the real system first."
             )
-        force = force_of(twin := require_twin(self.twin, self.twin_spec))
-        silent = {} if force is None else {f"{force[0]}.share": 0.0}
-        return diagnose(twin.with_parameters(**self.nominal | silent), data, **arguments)
+        twin = require_twin(self.twin, self.twin_spec)
+        return diagnose(twin.with_parameters(**self.nominal | no_force(twin)), data, **arguments)
 
     def extend_model(self, **arguments: Any) -> Diagnosis | None:
         """
@@ -317,11 +321,11 @@ class HDS(TwinAlgorithm):
         return super().was_compared or self._n_blocks > 1
 
     def varied(self, twin: Twin) -> Params:
-        drawn, force = super().varied(twin), force_of(twin)
-        if force is not None:
+        drawn, share_name = super().varied(twin), force_share_name(twin)
+        if share_name is not None:
             n = self.config.n_rollouts
             chosen = np.random.permutation(n) < round(self.model_beta * n)
-            drawn[f"{force[0]}.share"] = jnp.asarray(chosen, jnp.float32)
+            drawn[share_name] = jnp.asarray(chosen, jnp.float32)
         return drawn
 
     def _correction_config(self, twin: Twin) -> CorrectionConfig:
@@ -346,13 +350,13 @@ class HDS(TwinAlgorithm):
             names_to_estimate(twin, config.calibrated)
         return twin
 
-    def _source(self) -> Source:
+    def _source(self) -> MeasuredSteps:
         """The replay buffer, with the step that callbacks received and SB3 has not stored yet."""
         dt = None if self.twin is None else self.twin.dt
         buffer, step = getattr(self, "replay_buffer", None), self.unstored_step
         limit = self.config.max_saved_steps
         if buffer is None or step is None:
-            return Source(buffer, dt, self.action_space, limit)
+            return MeasuredSteps(buffer, dt, self.action_space, limit)
         buffer = copy.copy(buffer)
         if buffer.full:
             # The step would overwrite the oldest one, which the model still has; otherwise, it goes
@@ -364,7 +368,7 @@ class HDS(TwinAlgorithm):
         named: Any = {names.get(name, name): value for name, value in step.items()}
         OffPolicyAlgorithm._store_transition(self, buffer, **named)
         self._last_obs, self._last_original_obs = before
-        return Source(buffer, dt, self.action_space, limit)
+        return MeasuredSteps(buffer, dt, self.action_space, limit)
 
     def _progress_remaining(self) -> float:
         remaining = super()._progress_remaining()

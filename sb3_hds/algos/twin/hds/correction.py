@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,10 +13,11 @@ from sb3_hds.algos.twin.hds.windows import (
     ChangePoint,
     Windows,
     detect_change,
+    force_share_name,
     hold_out_windows,
     latest_windows,
+    no_force,
     rms,
-    shares_of,
     windows_of,
 )
 from sb3_hds.algos.twin.planning_twin import missing_effects, nulls_of
@@ -83,8 +84,8 @@ class Correction:
 
     :param twin: the corrected twin
     :param beta: share of rollouts in the learned model
-    :param changed: whether the model has changed so much that plans should be made again
-    :param change: start of the data that count, if a change of the system was detected
+    :param replan: whether the model has changed so much that plans should be made again
+    :param change_point: start of the data that count, if a change of the system was detected
     :param attached: nominal values of the parameters of newly attached effects
     :param fit: of the parameters, if they were estimated
     :param residual: the learned force, if it was learned
@@ -95,8 +96,8 @@ class Correction:
 
     twin: Twin
     beta: float
-    changed: bool
-    change: ChangePoint | None = None
+    replan: bool
+    change_point: ChangePoint | None = None
     attached: Mapping[str, float] = dataclasses.field(default_factory=dict)
     fit: Fit | None = None
     residual: Residual | None = None
@@ -109,7 +110,8 @@ class Correction:
         :return: by key, the errors and current parameters; and the limits of the intervals of
             parameters whose estimates were accepted
         """
-        values: dict[str, float] = {"beta": self.beta, "forgotten": int(self.change is not None)}
+        forgotten = int(self.change_point is not None)
+        values: dict[str, float] = {"beta": self.beta, "forgotten": forgotten}
         for name in ("error_twin", "error_calibrated", "error_hybrid"):
             error = getattr(self, name)
             if not (np.isnan(error) or (name == "error_calibrated" and self.fit is None)):
@@ -125,8 +127,19 @@ class Correction:
             if value == estimate.estimate:
                 intervals[f"{estimate.name}_low"] = estimate.low
                 intervals[f"{estimate.name}_high"] = estimate.high
-        with_prefix = lambda found: {f"model/{name}": x for name, x in found.items()}  # noqa: E731
+        with_prefix = lambda logged: {f"model/{name}": x for name, x in logged.items()}  # noqa: E731
         return with_prefix(values), with_prefix(intervals)
+
+
+class Tested(NamedTuple):
+    """
+    A twin whose predictions were compared with the data.
+
+    :param errors: of each window
+    """
+
+    twin: Twin
+    errors: np.ndarray
 
 
 def correct(
@@ -158,111 +171,83 @@ def correct(
         single = single_step_errors(twin, recent, std, _N_SINGLE)
         typical = float(np.quantile(single, _QUANTILE))
         if typical < _EXACT_STEP:
-            return Correction(twin, beta, changed=False, error_twin=typical)
+            return Correction(twin, beta, replan=False, error_twin=typical)
     try:
         windows = windows_of(data, twin, std, change)
     except TrajectoryError:
-        return Correction(twin, beta, changed=False)
-    nominal = twin.with_parameters(**config.nominal)
-    nominal_errors, current_errors = (windows.errors(t) for t in (nominal, twin))
+        return Correction(twin, beta, replan=False)
+    both = twin.with_parameters(**config.nominal), twin
+    nominal, current = (Tested(each, windows.errors(each)) for each in both)
     real = windows.counted
     if len(real) < FEWEST:
-        return Correction(twin, beta, changed=False, error_twin=rms(nominal_errors[real]))
+        return Correction(twin, beta, replan=False, error_twin=rms(nominal.errors[real]))
     latest = latest_windows(windows, n_new)
-    if max(rms(nominal_errors[real]), rms(nominal_errors[latest])) < EXACT:
-        changed = gain(nominal_errors[real], current_errors[real]) > _NOTICEABLE
-        return Correction(nominal, 0.0, changed=changed, error_twin=rms(nominal_errors[real]))
-    windows, new_change = detect_change(windows, current_errors, latest, n_new)
-    windows = hold_out_windows(windows, new_change or change)
+    if max(rms(nominal.errors[real]), rms(nominal.errors[latest])) < EXACT:
+        replan = gain(nominal.errors[real], current.errors[real]) > _NOTICEABLE
+        error = rms(nominal.errors[real])
+        return Correction(nominal.twin, 0.0, replan=replan, error_twin=error)
+    windows, change_point = detect_change(windows, current.errors, latest, n_new)
+    windows = hold_out_windows(windows, change_point or change)
     real = windows.counted
-    if len(real) < FEWEST or not windows.held.any():
-        return Correction(
-            twin, beta, changed=False, change=new_change, error_twin=rms(nominal_errors[real])
-        )
-    found = _corrected(
-        nominal, twin, config, windows, nominal_errors, current_errors, beta, learn_force
-    )
-    return dataclasses.replace(found, change=new_change)
+    if len(real) < FEWEST or not windows.held_out.any():
+        error = rms(nominal.errors[real])
+        return Correction(twin, beta, replan=False, change_point=change_point, error_twin=error)
+    correction = _corrected(nominal, current, config, windows, beta, learn_force)
+    return dataclasses.replace(correction, change_point=change_point)
 
 
 def _corrected(
-    nominal: Twin,
-    twin: Twin,
+    nominal: Tested,
+    current: Tested,
     config: CorrectionConfig,
     windows: Windows,
-    nominal_errors: np.ndarray,
-    current_errors: np.ndarray,
     beta: float,
     learn_force: bool,
 ) -> Correction:
     """
     :param nominal: the twin before any data
-    :param nominal_errors: errors of the nominal twin
-    :param current_errors: errors of the current twin
+    :param current: the twin that was planned in so far, without its learned force
     """
-    nominal, twin, config, added = _add_suspects(nominal, twin, config)
-    fit = _calibrated(nominal, twin, windows, config)
-    calibrated, errors = _better_twin(nominal, twin, fit, nominal_errors, current_errors, windows)
-    calibrated, errors, added = _drop_useless_suspects(calibrated, errors, added, windows)
-    held = windows.held
-    found = Correction(
-        calibrated,
+    nominal, current, config, added = _add_suspects(nominal, current, config)
+    fit = _calibrated(nominal.twin, current.twin, windows, config)
+    best = _better_twin(nominal, current, fit, windows)
+    best, added = _drop_useless_suspects(best, added, windows)
+    held_out = windows.held_out
+    correction = Correction(
+        best.twin,
         0.0,
-        changed=False,
+        replan=False,
         attached=added,
         fit=fit,
-        error_twin=rms(nominal_errors[held]),
-        error_calibrated=rms(errors[held]),
+        error_twin=rms(nominal.errors[held_out]),
+        error_calibrated=rms(best.errors[held_out]),
     )
+    errors_before = current.errors
     if beta > 0.0:
-        current_errors = windows.errors(twin, twin.params)
-    found, errors = _with_residual(found, windows, errors, config, learn_force)
-    return dataclasses.replace(
-        found, changed=gain(errors[held], current_errors[held]) > _NOTICEABLE
-    )
+        errors_before = windows.errors(current.twin, current.twin.params)
+    correction, errors = _with_residual(correction, best, windows, config, learn_force)
+    replan = gain(errors[held_out], errors_before[held_out]) > _NOTICEABLE
+    return dataclasses.replace(correction, replan=replan)
 
 
 def _add_suspects(
-    nominal: Twin, twin: Twin, config: CorrectionConfig
-) -> tuple[Twin, Twin, CorrectionConfig, dict[str, float]]:
+    nominal: Tested, current: Tested, config: CorrectionConfig
+) -> tuple[Tested, Tested, CorrectionConfig, dict[str, float]]:
     """
     Attach suspected effects with nominal parameters, which leave the errors unchanged.
 
     :return: both twins with the suspected effects, the config with their parameters, and the
         nominal values of these
     """
-    missing = missing_effects(twin, config.suspected)
+    missing = missing_effects(current.twin, config.suspected)
     if not missing:
-        return nominal, twin, config, {}
-    nominal, twin = nominal.extend(*missing), twin.extend(*missing)
+        return nominal, current, config, {}
+    nominal, current = (t._replace(twin=t.twin.extend(*missing)) for t in (nominal, current))
     added = nulls_of(missing)
     config = dataclasses.replace(
         config, names=(*config.names, *added), nominal={**config.nominal, **added}
     )
-    return nominal, twin, config, added
-
-
-def _drop_useless_suspects(
-    twin: Twin,
-    errors: np.ndarray,
-    added: Mapping[str, float],
-    windows: Windows,
-) -> tuple[Twin, np.ndarray, dict[str, float]]:
-    """
-    Detach suspected effects that do not lower the error, since they cost simulation time; the next
-    correction estimates them again.
-
-    :return: the twin without those effects, its errors, and ``added`` without their parameters
-    """
-    remaining = dict(added)
-    for key in dict.fromkeys(name.rpartition(".")[0] for name in added):
-        own = {name: null for name, null in added.items() if name.startswith(f"{key}.")}
-        reduced = twin.with_parameters(**own)
-        without = windows.errors(reduced)
-        if gain(errors[windows.held], without[windows.held]) < _LEAST_OF_SUSPECT:
-            twin, errors = reduced.without(key), without
-            remaining = {name: null for name, null in remaining.items() if name not in own}
-    return twin, errors, remaining
+    return nominal, current, config, added
 
 
 def _calibrated(
@@ -275,10 +260,9 @@ def _calibrated(
     if not config.names:
         return None
     prior_values = np.array([nominal.values[name] for name in config.names])
-    start = twin.with_parameters(**dict.fromkeys(shares_of(twin), 0.0))
     try:
         return fit_windows(
-            start,
+            twin.with_parameters(**no_force(twin)),
             untied(config.names),
             windows.learned,
             windows.origin,
@@ -291,69 +275,86 @@ def _calibrated(
         return None
 
 
-def _better_twin(
-    nominal: Twin,
-    twin: Twin,
-    fit: Fit | None,
-    nominal_errors: np.ndarray,
-    current_errors: np.ndarray,
-    windows: Windows,
-) -> tuple[Twin, np.ndarray]:
-    """:return: the best of calibrated, current and nominal twin, and its errors"""
-    held = windows.held
-    current = nominal, nominal_errors
-    if current_errors[held].mean() < nominal_errors[held].mean():
-        current = twin, current_errors
+def _better_twin(nominal: Tested, current: Tested, fit: Fit | None, windows: Windows) -> Tested:
+    """:return: the best of calibrated, current and nominal twin"""
+    held_out = windows.held_out
+    better = nominal
+    if current.errors[held_out].mean() < nominal.errors[held_out].mean():
+        better = current
     if fit is None or not all(np.isfinite(e.estimate) for e in fit.estimates):
-        return current
-    if not windows.held_out_by_recording and probability_before(fit, nominal) < _IMPROBABLE:
-        return current
-    new = twin.with_parameters(**{e.name: e.estimate for e in fit.estimates})
-    errors = windows.errors(new)
+        return better
+    if not windows.held_out_by_recording and probability_before(fit, nominal.twin) < _IMPROBABLE:
+        return better
+    twin = current.twin.with_parameters(**{e.name: e.estimate for e in fit.estimates})
+    calibrated = Tested(twin, windows.errors(twin))
     if (
-        gain(errors[held], nominal_errors[held]) > _LEAST_OF_CALIBRATION
-        and gain(errors[held], current_errors[held]) >= 0.0
+        gain(calibrated.errors[held_out], nominal.errors[held_out]) > _LEAST_OF_CALIBRATION
+        and gain(calibrated.errors[held_out], current.errors[held_out]) >= 0.0
     ):
-        return new, errors
-    return current
+        return calibrated
+    return better
+
+
+def _drop_useless_suspects(
+    best: Tested, added: Mapping[str, float], windows: Windows
+) -> tuple[Tested, dict[str, float]]:
+    """
+    Detach suspected effects that do not lower the error, since they cost simulation time; the next
+    correction estimates them again.
+
+    :return: the twin without those effects, and ``added`` without their parameters
+    """
+    remaining = dict(added)
+    for key in dict.fromkeys(name.rpartition(".")[0] for name in added):
+        own = {name: null for name, null in added.items() if name.startswith(f"{key}.")}
+        reduced = best.twin.with_parameters(**own)
+        errors = windows.errors(reduced)
+        if gain(best.errors[windows.held_out], errors[windows.held_out]) < _LEAST_OF_SUSPECT:
+            best = Tested(reduced.without(key), errors)
+            remaining = {name: null for name, null in remaining.items() if name not in own}
+    return best, remaining
 
 
 def _with_residual(
-    found: Correction,
+    correction: Correction,
+    best: Tested,
     windows: Windows,
-    errors: np.ndarray,
     config: CorrectionConfig,
     learn_force: bool,
 ) -> tuple[Correction, np.ndarray]:
-    """:return: the correction, and the errors of the model to plan in"""
-    twin, residual, held = found.twin, None, windows.held
-    wanted = config.beta != 0.0 and rms(errors[held]) > EXACT
+    """
+    :param best: the twin of the correction
+    :return: the correction, and the errors of the model to plan in
+    """
+    (twin, errors), residual, held_out = best, None, windows.held_out
+    wanted = config.beta != 0.0 and rms(errors[held_out]) > EXACT
     if wanted and learn_force:
-        scale = 0.05 * windows.std if found.fit is None else found.fit.noise
+        scale = 0.05 * windows.std if correction.fit is None else correction.fit.noise
         scale = np.maximum(scale, 1e-3 * windows.std)
         try:
             residual = fit_force(
-                twin, windows.shots, held, scale, seed=config.seed, **config.residual_kwargs
+                twin, windows.shots, held_out, scale, seed=config.seed, **config.residual_kwargs
             )
         except CalibrationError:
             residual = None
     hybrid = twin if residual is None else residual.twin
-    key = next(iter(shares_of(hybrid)), None)
-    if key is None:
-        return found, errors
-    hybrid_errors = windows.errors(hybrid, {**hybrid.params, key: 1.0})
-    found = dataclasses.replace(found, residual=residual, error_hybrid=rms(hybrid_errors[held]))
+    share_name = force_share_name(hybrid)
+    if share_name is None:
+        return correction, errors
+    hybrid_errors = windows.errors(hybrid, {**hybrid.params, share_name: 1.0})
+    error_hybrid = rms(hybrid_errors[held_out])
+    correction = dataclasses.replace(correction, residual=residual, error_hybrid=error_hybrid)
     # A force that does not lower the error only costs simulation time.
-    if residual is not None and not (residual.accepted or shares_of(twin)):
-        return found, errors
-    helps = is_better(hybrid_errors[held], errors[held])
-    share = 0.0
+    if residual is not None and not (residual.accepted or force_share_name(twin)):
+        return correction, errors
+    helps = is_better(hybrid_errors[held_out], errors[held_out])
+    beta = 0.0
     if helps:
-        trust = min(1.0, gain(hybrid_errors[held], errors[held]) / _TRUSTED)
-        share = trust if config.beta == "auto" else float(config.beta)
-    twin = hybrid.with_parameters(**{key: 1.0 if helps else 0.0})
-    found = dataclasses.replace(found, twin=twin, beta=share)
-    return found, hybrid_errors if share > 0.0 else errors
+        trust = min(1.0, gain(hybrid_errors[held_out], errors[held_out]) / _TRUSTED)
+        beta = trust if config.beta == "auto" else float(config.beta)
+    twin = hybrid.with_parameters(**{share_name: 1.0 if helps else 0.0})
+    correction = dataclasses.replace(correction, twin=twin, beta=beta)
+    return correction, hybrid_errors if beta > 0.0 else errors
 
 
 def names_to_estimate(twin: Twin, wanted: str | Sequence[str] | None) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from sb3_hds.errors import TrajectoryError
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-class Source(NamedTuple):
+class MeasuredSteps(NamedTuple):
     """
     The replay buffer with the measured steps.
 
@@ -42,7 +42,9 @@ class RecordedSteps:
     :param earlier: data from before this model, for example a file of random motion
     """
 
-    def __init__(self, source: Callable[[], Source], earlier: Trajectories | None = None) -> None:
+    def __init__(
+        self, source: Callable[[], MeasuredSteps], earlier: Trajectories | None = None
+    ) -> None:
         self._source = source
         self.earlier = None if earlier is None else _counted(earlier)
         self._recordings = Recordings(self._n_earlier)

@@ -42,7 +42,7 @@ class Windows(NamedTuple):
     :param place: position of each window in its recording
     :param age: steps from the start of each window to the end of the data
     :param std: standard deviation of each channel
-    :param held: whether each window is held out
+    :param held_out: whether each window is held out
     """
 
     shots: Shots
@@ -50,7 +50,7 @@ class Windows(NamedTuple):
     place: np.ndarray
     age: np.ndarray
     std: Float[np.ndarray, " obs"]
-    held: np.ndarray
+    held_out: np.ndarray
 
     @property
     def counted(self) -> np.ndarray:
@@ -60,18 +60,18 @@ class Windows(NamedTuple):
     @property
     def held_out_by_recording(self) -> bool:
         """Whether the recordings of held-out windows have no others."""
-        learned = self.origin[~self.held & (self.origin >= 0)]
-        return not np.isin(self.origin[self.held], learned).any()
+        learned = self.origin[~self.held_out & (self.origin >= 0)]
+        return not np.isin(self.origin[self.held_out], learned).any()
 
     @property
     def learned(self) -> Shots:
         """The windows that are not held out."""
-        return self.shots._replace(weight=self.shots.weight * ~self.held)
+        return self.shots._replace(weight=self.shots.weight * ~self.held_out)
 
     def errors(self, twin: Twin, params: Params | None = None) -> np.ndarray:
         """:return: error of each window with these parameters; None: the twin's, without force"""
         if params is None:
-            params = twin.params | dict.fromkeys(shares_of(twin), 0.0)
+            params = twin.params | no_force(twin)
         return window_errors(twin, params, self.shots, self.std)
 
 
@@ -120,13 +120,19 @@ def hold_out_windows(windows: Windows, change: ChangePoint | None) -> Windows:
     first = 0 if change is None else change.recording
     number = np.where(windows.origin >= 0, windows.origin - first, -1)
     share = _HELD if len(windows.counted) >= _MANY else _HELD_OF_FEW
-    return windows._replace(held=hold_out(number, windows.place, share))
+    return windows._replace(held_out=hold_out(number, windows.place, share))
 
 
-def shares_of(twin: Twin) -> tuple[str, ...]:
+def force_share_name(twin: Twin) -> str | None:
     """:return: full name of the parameter that scales the learned force, if there is one"""
     force = force_of(twin)
-    return () if force is None else (f"{force[0]}.share",)
+    return None if force is None else f"{force[0]}.share"
+
+
+def no_force(twin: Twin) -> dict[str, float]:
+    """:return: the parameter value that switches the learned force off, if there is one"""
+    name = force_share_name(twin)
+    return {} if name is None else {name: 0.0}
 
 
 def rms(errors: np.ndarray) -> float:
