@@ -19,7 +19,7 @@ from sb3_hds.algos.twin.state import (
     resets,
 )
 from sb3_hds.algos.twin.threads import run_in_parallel
-from sb3_hds.core import Twin
+from sb3_hds.core import Params, State, Twin
 from sb3_hds.core.numerics.compilation import GENERATOR, QUICK_COMPILATION
 from sb3_hds.planning import Problem, follow
 
@@ -114,7 +114,10 @@ def mean_return(
     rollouts = np.linspace(0, config.n_rollouts - 1, _n_starts(twin)).round().astype(int)
     varied = jax.tree.map(lambda leaf: leaf[rollouts], hyper.varied)
     policy = lambda obs: output(config.actor, actor, inside(hyper.vec_normalize(obs)))  # noqa: E731
-    value = lambda s, own: follow(problem.with_params(own), s, policy, length).value  # noqa: E731
+
+    def value(start: State, varied: Params) -> jax.Array:
+        return follow(problem.with_params(varied), start, policy, length).value
+
     return jnp.mean(grouped_vmap(value, starts, varied)), jax.random.key_data(after)
 
 

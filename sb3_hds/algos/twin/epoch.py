@@ -43,7 +43,7 @@ _TIE = 1e-3
 _RANDOM_SHARE = 0.5
 
 
-class Outcome(NamedTuple):
+class PlanningMetrics(NamedTuple):
     """
     Metrics of planning. Returns are discounted planning rewards, in the reward's own unit.
 
@@ -69,13 +69,13 @@ class EpochMetrics(NamedTuple):
     :param gradient_norm: mean norm of the policy's gradient before it is clipped
     """
 
-    plans: Outcome
+    plans: PlanningMetrics
     policy_loss: jax.Array
     value_loss: jax.Array
     gradient_norm: jax.Array
 
 
-class Choice(NamedTuple):
+class KeptPlans(NamedTuple):
     """
     The plans of one epoch; leaves of shape ``(n_rollouts, ...)``.
 
@@ -99,9 +99,9 @@ def epoch(
 
     :return: the state after the epoch, and its metrics
     """
-    state, outcome = plan_ahead(config, state, hyper)
+    state, metrics = plan_ahead(config, state, hyper)
     state, losses = learn_from_plans(config, state, hyper)
-    return state, EpochMetrics(outcome, *losses)
+    return state, EpochMetrics(metrics, *losses)
 
 
 def epoch_log(
@@ -132,46 +132,24 @@ def epoch_log(
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILATION)
 def plan_ahead(
     config: EpochConfig, state: EpochState, hyper: Hyperparams
-) -> tuple[EpochState, Outcome]:
+) -> tuple[EpochState, PlanningMetrics]:
     """The first half of an epoch: rollouts and planning in the twin."""
     key = jax.random.wrap_key_data(state.progress.key, impl=GENERATOR)
     key, k_noise, k_plan, k_move = jax.random.split(key, 4)
     problem = planning_problem(config, state, hyper)
     starts = state.workspace.starts
     own, exploring = _roll_out(config, state, hyper, problem, starts, k_noise)
-    choice = _plan(config, state, hyper, problem, own, k_plan)
-    gain = jnp.maximum(choice.kept.value - choice.own.value, 0.0)
-    samples, finite = samples_of(
-        hyper, problem, choice.kept, choice.tails, gain, choice.sensitivity
-    )
+    plans = _plan(config, state, hyper, problem, own, k_plan)
+    gain = jnp.maximum(plans.kept.value - plans.own.value, 0.0)
+    samples, finite = samples_of(hyper, problem, plans.kept, plans.tails, gain, plans.sensitivity)
     moved, ages = _advance_starts(config, state, hyper, exploring, k_move)
-    outcome = _outcome(config, state, choice, finite)
+    metrics = _planning_metrics(config, state, plans, finite)
     state = remember(config, state, samples)
     if config.adapt_scales:
         state = rescale(state, samples)
     progress = state.progress._replace(gain=_mean(gain, finite), key=jax.random.key_data(key))
     workspace = state.workspace._replace(starts=moved, ages=ages)
-    return state._replace(progress=progress, workspace=workspace), outcome
-
-
-def control_of(config: EpochConfig, state: EpochState, hyper: Hyperparams, obs: Obs) -> Control:
-    """:return: control of the policy in training for an observation of the twin"""
-    seen = state.networks.inside(hyper.vec_normalize(obs))
-    return output(config.actor, state.networks.actor, seen)
-
-
-def twin_steps_per_epoch(config: EpochConfig) -> int:
-    """
-    :return: simulated steps of one epoch, line searches included; a Jacobian counts as many steps
-        as finite differences would take, one per column and the step itself
-    """
-    s = config
-    columns = 2 * len(s.twin.joints) + len(s.twin.actuators)
-    improving = s.n_iterations * s.horizon * (1 + columns + s.n_step_sizes)
-    n, n_random = s.n_rollouts, _random_slots(s).size
-    acting = n * s.horizon * (2 if s.advance else 1)
-    planning = (n + n_random) * improving + n_random * s.n_candidates * s.horizon
-    return acting + planning + (2 * n + n_random) * s.lookahead
+    return state._replace(progress=progress, workspace=workspace), metrics
 
 
 def _roll_out(
@@ -207,7 +185,7 @@ def _plan(
     problem: Problem,
     own: Plan,
     key: PRNGKeyArray,
-) -> Choice:
+) -> KeptPlans:
     """Improve the policy's own and random plans, and choose the plan to keep for each start."""
     k_random, k_improve, k_keep = jax.random.split(key, 3)
     n, slots = config.n_rollouts, _random_slots(config)
@@ -229,22 +207,28 @@ def _plan(
 
     plans, varied = _concatenated(improved, own), _concatenated(varied, hyper.varied)
     ends = jax.tree.map(lambda leaf: leaf[:, -1], plans.states)
-    value_of_end = lambda end, own: _tail(config, problem.with_params(own), policy, end)  # noqa: E731
+
+    def value_of_end(end: State, varied: Params) -> jax.Array:
+        return _tail(config, problem.with_params(varied), policy, end)
+
     tails = grouped_vmap(value_of_end, ends, varied)
     values = jax.vmap(lambda p, tail: score(problem, p.rewards, p.alive, tail))(plans, tails)
     plans = plans._replace(value=values)
 
-    random_plans = n + np.arange(slots.size)
-    better = values[random_plans] > values[slots] + _TIE
-    best = jnp.arange(n).at[slots].set(jnp.where(better, random_plans, slots))
-    unchanged = n + slots.size + jnp.arange(n)
-    advantage = values[best] - values[unchanged]
+    # Rows: the policy's plans after improvement, improved random ones, the policy's own before.
+    rows_random, rows_own = n + np.arange(slots.size), n + slots.size + jnp.arange(n)
+    better = values[rows_random] > values[slots] + _TIE
+    best = jnp.arange(n).at[slots].set(jnp.where(better, rows_random, slots))
+    advantage = values[best] - values[rows_own]
     if config.annealed:
         temperature = hyper.temperature * state.progress.gain
         advantage += temperature * jax.random.logistic(k_keep, (n,))
-    kept = jnp.where(advantage > 0.0, best, unchanged)
-    return Choice(
-        _rows(plans, unchanged), _rows(plans, kept), _rows(tails, kept), _rows(sensitivity, best)
+    kept = jnp.where(advantage > 0.0, best, rows_own)
+    return KeptPlans(
+        own=_rows(plans, rows_own),
+        kept=_rows(plans, kept),
+        tails=_rows(tails, kept),
+        sensitivity=_rows(sensitivity, best),
     )
 
 
@@ -267,8 +251,8 @@ def _improve(
     discounts = config.discount ** jnp.arange(config.horizon)
     temperature = hyper.temperature * state.progress.gain
 
-    def one(first: Plan, own: Params, key: PRNGKeyArray | None):
-        here = problem.with_params(own)
+    def one(first: Plan, varied: Params, key: PRNGKeyArray | None):
+        here = problem.with_params(varied)
         start = jax.tree.map(lambda leaf: leaf[0], first.states)
         options = {
             "n_iterations": config.n_iterations,
@@ -320,16 +304,18 @@ def _reset_rates(share: float, n: int) -> Float[Array, " rollouts"]:
     return position ** (1.0 / share - 1.0)
 
 
-def _outcome(config: EpochConfig, state: EpochState, choice: Choice, finite: jax.Array) -> Outcome:
+def _planning_metrics(
+    config: EpochConfig, state: EpochState, plans: KeptPlans, finite: jax.Array
+) -> PlanningMetrics:
     forever = 1.0 / (1.0 - config.discount) if config.discount < 1.0 else config.horizon
     progress = state.progress
     unit = lambda value: value / progress.reward_scale + progress.reward_offset * forever  # noqa: E731
-    both = finite & jnp.isfinite(choice.own.value)
-    return Outcome(
-        unit(_mean(choice.own.value, both)),
-        unit(_mean(choice.kept.value, both)),
-        jnp.sum(choice.kept.value < choice.own.value),
-        jnp.sum(~finite) * config.horizon,
+    both = finite & jnp.isfinite(plans.own.value)
+    return PlanningMetrics(
+        before=unit(_mean(plans.own.value, both)),
+        after=unit(_mean(plans.kept.value, both)),
+        worsened=jnp.sum(plans.kept.value < plans.own.value),
+        dropped=jnp.sum(~finite) * config.horizon,
     )
 
 
@@ -353,7 +339,27 @@ def _choose_rows(condition, new, old):
     return jax.tree.map(lambda a, b: jnp.where(rows(a), a, b), new, old)
 
 
+def control_of(config: EpochConfig, state: EpochState, hyper: Hyperparams, obs: Obs) -> Control:
+    """:return: control of the policy in training for an observation of the twin"""
+    seen = state.networks.inside(hyper.vec_normalize(obs))
+    return output(config.actor, state.networks.actor, seen)
+
+
 def programs(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> list[Callable[[], Any]]:
     """:return: the programs of an epoch, to be compiled in parallel by running each once"""
     used = [plan_ahead, *regressions(config)]
     return [partial(program, config, state, hyper) for program in used]
+
+
+def twin_steps_per_epoch(config: EpochConfig) -> int:
+    """
+    :return: simulated steps of one epoch, line searches included; a Jacobian counts as many steps
+        as finite differences would take, one per column and the step itself
+    """
+    s = config
+    columns = 2 * len(s.twin.joints) + len(s.twin.actuators)
+    improving = s.n_iterations * s.horizon * (1 + columns + s.n_step_sizes)
+    n, n_random = s.n_rollouts, _random_slots(s).size
+    acting = n * s.horizon * (2 if s.advance else 1)
+    planning = (n + n_random) * improving + n_random * s.n_candidates * s.horizon
+    return acting + planning + (2 * n + n_random) * s.lookahead

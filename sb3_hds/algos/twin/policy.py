@@ -204,16 +204,24 @@ def fresh_networks(
     adam = clipped_adam(max_grad_norm)
     zero = jnp.zeros(())
     progress = TrainingState(
-        adam.init(weights),
-        adam.init(value_weights),
-        jnp.ones(()),
-        zero,
-        jnp.ones(actor.n_act),
-        zero,
-        jnp.zeros((), jnp.int32),
-        jax.random.key_data(k_next),
+        actor_optimizer=adam.init(weights),
+        value_optimizer=adam.init(value_weights),
+        reward_scale=jnp.ones(()),
+        reward_offset=zero,
+        control_scale=jnp.ones(actor.n_act),
+        gain=zero,
+        n_epochs=jnp.zeros((), jnp.int32),
+        key=jax.random.key_data(k_next),
     )
-    return Networks(weights, weights, value_weights, inside, weights, inside), progress
+    networks = Networks(
+        actor=weights,
+        average=weights,
+        value=value_weights,
+        inside=inside,
+        acting=weights,
+        acting_inside=inside,
+    )
+    return networks, progress
 
 
 def clipped_adam(max_grad_norm: float) -> optax.GradientTransformation:

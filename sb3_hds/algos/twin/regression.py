@@ -196,11 +196,11 @@ def samples_of(
         return jnp.swapaxes(clean, 0, 1).reshape(-1, *x.shape[2:])
 
     samples = Samples(
-        flat(obs),
-        flat(kept.controls),
-        flat(targets),
-        flat(jnp.where(alive, weight, 0.0)),
-        flat(alive.astype(weight.dtype)),
+        obs=flat(obs),
+        control=flat(kept.controls),
+        value=flat(targets),
+        weight=flat(jnp.where(alive, weight, 0.0)),
+        alive=flat(alive.astype(weight.dtype)),
     )
     return samples, finite
 
