@@ -172,7 +172,7 @@ def test_random_plans_are_tried_for_half_of_the_rollouts():
     # Of so many, some surely win against the policy's own plan.
     none, some = (small("pods", n_random_plans=n, pretrain_epochs=1).learn(0) for n in (0, 32))
 
-    program = some._program
+    program = some._epoch_config
     # Four of eight: each draws so many plans, and improves and follows the best of them.
     columns = 2 * 1 + 1
     improving = program.n_iterations * program.horizon * (1 + columns + program.n_step_sizes)
@@ -183,7 +183,7 @@ def test_random_plans_are_tried_for_half_of_the_rollouts():
 
 def test_the_policy_learns_from_the_first_half_of_plans_and_the_value_from_all():
     model = small("pods", pretrain_epochs=1, learned_share=0.5).learn(0)
-    state, program = model._epoch_state(), model._program
+    state, program = model._epoch_state(), model._epoch_config
     hyper = hyper_of(model, 4)
     # Four steps of eight rollouts, first steps first.
     late = jnp.arange(4 * 8) >= 2 * 8
@@ -275,7 +275,7 @@ def test_what_an_end_is_worth_has_a_switch():
     worth = {}
     for shifted in (True, False):
         model = small("pods", "InvertedPendulum-v5", shift_ends=shifted)
-        problem = planning_problem(model._program, model._epoch_state(), hyper_of(model, 4))
+        problem = planning_problem(model._epoch_config, model._epoch_state(), hyper_of(model, 4))
         worth[shifted] = float(problem.value_when_terminated)
         best = float(problem.reward_offset * problem.reward_scale)
     # A reward of zero for ever, counted from the best one; or nothing.

@@ -9,6 +9,7 @@ their own counter.
 import dataclasses
 import math
 from collections.abc import Callable
+from concurrent.futures import Future
 from functools import partial
 from typing import Any, ClassVar
 
@@ -98,117 +99,13 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
         # In the current call of ``learn``.
         self._epochs_planned, self._epochs_done = 0, 0
         self._workspace: Workspace | None = None
-        # Config of the compiled programs, and the comparison of policies while it compiles.
+        # Config of the compiled programs; whether that of the comparison compiles, or is compiled.
         self._compiled: EpochConfig | None = None
-        self._comparison: Callable[[], Any] | None = None
+        self._comparison_compiles: Future[Any] | None = None
+        self._comparison_is_compiled = False
         # Whether a callback ended the training, and a function to call while programs compile.
         self.stopped = False
         self.poll: Callable[[], None] = no_poll
-
-    def train(self, gradient_steps: int, batch_size: int) -> None:
-        """One planning epoch with ``gradient_steps`` regression steps, between real steps."""
-        self._n_updates += gradient_steps
-        self.run_epoch(gradient_steps)
-
-    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        if self.stopped:
-            # A callback ended the training before the first step.
-            return RolloutReturn(0, 0, continue_training=False)
-        return super().collect_rollouts(*args, **kwargs)
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray,  # type: ignore[override]
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        self.unstored_step = None
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        self.real_timesteps += self.n_envs
-
-    def run_epoch(self, gradient_steps: int) -> EpochMetrics:
-        """
-        One planning epoch: improve plans in the twin and regress the policy on them.
-
-        :param gradient_steps: regression steps
-        :return: metrics, on the device
-        :raises NoTwinError: if the model was loaded without environment and without twin
-        :raises DivergedError: if the regression diverged; the model keeps its last finite state
-        """
-        state, program = self._epoch_state(), self._program
-        every = self.config.refinements.compare_every
-        n_epochs = int(self.policy.progress.n_epochs)
-        hyper = self.hyperparams(program.twin, gradient_steps)
-        if program != self._compiled:
-            run_in_threads(programs(program, state, hyper), self.poll)
-            self._compiled, self._comparison = program, None
-        # Compile the comparison in another thread during the epochs before it is due.
-        ahead = max(1, self._epochs_planned - self._epochs_done)
-        compares = every > 0 and (self.comparison_due or n_epochs % every + ahead >= every)
-        if compares and self._comparison is None:
-            self._comparison = run_in_thread(comparison(program, state, hyper)).result
-        state, metrics = epoch(program, state, hyper)
-        if self._comparison and is_compared(n_epochs + 1, every, self.comparison_due):
-            run_in_threads([self._comparison], self.poll)
-            self._comparison = no_poll
-        state, returns = choose_policy(
-            program, state, hyper, every, self.comparison_due, self.was_compared
-        )
-        losses = float(metrics.policy_loss), float(metrics.value_loss)
-        if not (all(map(math.isfinite, losses)) and all_finite(state.networks)):
-            raise DivergedError(
-                f"The regression diverged (losses {losses}); the model keeps the state before this "
-                "epoch. Lower learning_rate."
-            )
-        self.policy.networks, self.policy.progress = state.networks, state.progress
-        self._workspace = state.workspace
-        self._epochs_done += 1
-        self.twin_timesteps += twin_steps_per_epoch(program)
-        if returns is not None:
-            self.twin_timesteps += twin_steps_per_comparison(program)
-        for name, value in epoch_log(metrics, hyper, returns).items():
-            self.logger.record(name, value)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("time/epochs", int(self.policy.progress.n_epochs))
-        self.logger.record("time/twin_timesteps", self.twin_timesteps)
-        return metrics
-
-    def hyperparams(self, twin: Twin, gradient_steps: int) -> Hyperparams:
-        """:return: the hyperparameters of the next epoch, which may change without recompiling"""
-        config, n_epochs = self.config, int(self.policy.progress.n_epochs)
-        how = config.refinements
-        return Hyperparams(
-            params=twin.params,
-            varied=self.varied(twin),
-            learning_rate=self.lr_schedule(self._progress_remaining()),
-            noise=config.exploration_noise * config.exploration_decay**n_epochs,
-            temperature=config.temperature * _TEMPERATURE_DECAY**n_epochs,
-            reset_share=config.reset_share,
-            gain_weight=how.gain_weight,
-            sensitivity_weight=how.sensitivity_weight,
-            averaging=how.averaging,
-            gradient_steps=gradient_steps,
-            vec_normalize=self._normalization(twin),
-        )
-
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """
-        :param env: an environment with a twin, the same spaces and the same number of copies
-        :param force_reset: False continues from the environment's current state
-        :raises NoTwinError: if it has no twin; the model then keeps its environment
-        """
-        before = self.env, self.n_envs, self._vec_normalize_env, self._last_obs
-        super().set_env(env, force_reset)
-        try:
-            self._match_env()
-        except Exception:
-            self.env, self.n_envs, self._vec_normalize_env, self._last_obs = before
-            raise
-        if self._last_obs is None:
-            self.unstored_step = None
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -219,15 +116,6 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
         self.policy.build(jax.random.key(self.network_seed, impl=GENERATOR), device)
         self._workspace = None
         self._setup_twin()
-
-    def remedies(self, updates_per_step: float) -> list[str]:
-        n = self.config.n_rollouts
-        return [
-            f"n_rollouts={max(1, n // 4)}, {n} now",
-            "a larger train_freq",
-            f"fewer gradient_steps, {updates_per_step:.3g} for each step now",
-            "a GPU",
-        ]
 
     def _setup_twin(self) -> None:
         """Set the twin: the one that was passed, or had been when saved, or the environment's."""
@@ -260,68 +148,26 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
         """:return: the twin to plan in, given the environment's twin or the one that was passed"""
         return twin
 
-    @property
-    def comparison_due(self) -> bool:
-        """Whether policies are compared after this epoch regardless of ``compare_every``."""
-        return False
-
-    @property
-    def was_compared(self) -> bool:
-        """Whether policies were compared after an earlier epoch."""
-        every = self.config.refinements.compare_every
-        return every > 0 and int(self.policy.progress.n_epochs) >= every
-
-    def varied(self, twin: Twin) -> Params:
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
-        :return: parameters that differ between the rollouts of an epoch, each of shape
-            ``(n_rollouts,)``
+        :param env: an environment with a twin, the same spaces and the same number of copies
+        :param force_reset: False continues from the environment's current state
+        :raises NoTwinError: if it has no twin; the model then keeps its environment
         """
-        config = self.config
-        if not config.randomisation:
-            return {}
-        drawn = {}
-        for name, parameter in twin.parameters.items():
-            deviation = config.randomisation * parameter.scale * np.random.randn(config.n_rollouts)
-            values = np.clip(twin.values[name] + deviation, parameter.lower, parameter.upper)
-            drawn[name] = jnp.asarray(values, jnp.float32)
-        return drawn
+        before = self.env, self.n_envs, self._vec_normalize_env, self._last_obs
+        super().set_env(env, force_reset)
+        try:
+            self._match_env()
+        except Exception:
+            self.env, self.n_envs, self._vec_normalize_env, self._last_obs = before
+            raise
+        if self._last_obs is None:
+            self.unstored_step = None
 
-    def before_planning(self) -> None:
-        """Called when a training starts, before the first planning epoch."""
-
-    @property
-    def _program(self) -> EpochConfig:
-        """Static configuration of an epoch."""
-        return epoch_config(self.config, self.policy, require_twin(self.twin, self.twin_spec))
-
-    def _normalization(self, twin: Twin) -> Any:
-        return normalization_of(self.get_vec_normalize_env(), len(twin.channels))
-
-    def _epoch_state(self) -> EpochState:
-        """The state that an epoch changes; before the first one, find the scales of the task."""
-        program, policy = self._program, self.policy
-        workspace = self._workspace
-        if workspace is None:
-            fresh = int(policy.progress.n_epochs) == 0
-            if fresh:
-                seed = int(np.asarray(policy.progress.key)[0])
-                prepare_statistics(self.get_vec_normalize_env(), program.twin, jax.random.key(seed))
-            normalization, params = self._normalization(program.twin), program.twin.params
-            started = partial(init_workspace, program, params, normalization, policy.progress)
-            [(workspace, scales, progress)] = run_in_threads([started], self.poll)
-            if fresh:
-                policy.networks = policy.networks._replace(inside=scales.inside)
-                progress = progress._replace(
-                    reward_scale=scales.reward_scale, reward_offset=scales.reward_offset
-                )
-            self._workspace, policy.progress = workspace, progress
-        return EpochState(policy.networks, policy.progress, workspace)
-
-    def _progress_remaining(self) -> float:
-        """From 1 to 0 over the planning epochs of this call of ``learn``, pretraining included."""
-        if not self._epochs_planned:
-            return 1.0
-        return max(0.0, 1.0 - self._epochs_done / self._epochs_planned)
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        """SB3 calls it once everything is set up for ``learn``: the pretraining runs there."""
+        around = PretrainingCallback(callbacks_of(callback), progress_bar)
+        return super()._init_callback(around, progress_bar)
 
     def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any):
         before = self._last_obs
@@ -340,7 +186,10 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
         assert isinstance(self.train_freq, TrainFreq)
         if self.train_freq.unit.value == "step":
             return self.train_freq.frequency * self.n_envs
-        return self.train_freq.frequency * longest_episode(self._program.twin)
+        return self.train_freq.frequency * longest_episode(self._epoch_config.twin)
+
+    def before_planning(self) -> None:
+        """Called when a training starts, before the first planning epoch."""
 
     @property
     def pretraining_due(self) -> int:
@@ -365,9 +214,170 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
         self.n_pretrained += 1
         self._epochs_done += planned - 1 - self.pretraining_due
 
-    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        around = PretrainingCallback(callbacks_of(callback), progress_bar)
-        return super()._init_callback(around, progress_bar)
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        if self.stopped:
+            # A callback ended the training before the first step.
+            return RolloutReturn(0, 0, continue_training=False)
+        return super().collect_rollouts(*args, **kwargs)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray,  # type: ignore[override]
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        self.unstored_step = None
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self.real_timesteps += self.n_envs
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """One planning epoch with ``gradient_steps`` regression steps, between real steps."""
+        self._n_updates += gradient_steps
+        self.run_epoch(gradient_steps)
+
+    def run_epoch(self, gradient_steps: int) -> EpochMetrics:
+        """
+        One planning epoch: improve plans in the twin and regress the policy on them.
+
+        :param gradient_steps: regression steps
+        :return: metrics, on the device
+        :raises NoTwinError: if the model was loaded without environment and without twin
+        :raises DivergedError: if the regression diverged; the model keeps its last finite state
+        """
+        state, static = self._epoch_state(), self._epoch_config
+        hyper = self.hyperparams(static.twin, gradient_steps)
+        self._compile_ahead(static, state, hyper)
+        state, metrics = epoch(static, state, hyper)
+        every = self.config.refinements.compare_every
+        due = is_compared(int(state.progress.n_epochs), every, self.comparison_due)
+        if due and self._comparison_compiles is not None:
+            run_in_threads([self._comparison_compiles.result], self.poll)
+            self._comparison_compiles, self._comparison_is_compiled = None, True
+        state, returns = choose_policy(static, state, hyper, due, self.was_compared)
+        losses = float(metrics.policy_loss), float(metrics.value_loss)
+        if not (all(map(math.isfinite, losses)) and all_finite(state.networks)):
+            raise DivergedError(
+                f"The regression diverged (losses {losses}); the model keeps the state before this "
+                "epoch. Lower learning_rate."
+            )
+        self.policy.networks, self.policy.progress = state.networks, state.progress
+        self._workspace = state.workspace
+        self._epochs_done += 1
+        self.twin_timesteps += twin_steps_per_epoch(static)
+        if returns is not None:
+            self.twin_timesteps += twin_steps_per_comparison(static)
+        for name, value in epoch_log(metrics, hyper, returns).items():
+            self.logger.record(name, value)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("time/epochs", int(self.policy.progress.n_epochs))
+        self.logger.record("time/twin_timesteps", self.twin_timesteps)
+        return metrics
+
+    def _compile_ahead(self, static: EpochConfig, state: EpochState, hyper: Hyperparams) -> None:
+        """
+        Compile the programs of an epoch unless they are, and that of the comparison in another
+        thread during the epochs before it is due.
+        """
+        if static != self._compiled:
+            run_in_threads(programs(static, state, hyper), self.poll)
+            self._compiled = static
+            self._comparison_compiles, self._comparison_is_compiled = None, False
+        every = self.config.refinements.compare_every
+        n_epochs = int(self.policy.progress.n_epochs)
+        ahead = max(1, self._epochs_planned - self._epochs_done)
+        soon = every > 0 and (self.comparison_due or n_epochs % every + ahead >= every)
+        if soon and self._comparison_compiles is None and not self._comparison_is_compiled:
+            self._comparison_compiles = run_in_thread(comparison(static, state, hyper))
+
+    def _epoch_state(self) -> EpochState:
+        """The state that an epoch changes; before the first one, find the scales of the task."""
+        static, policy = self._epoch_config, self.policy
+        workspace = self._workspace
+        if workspace is None:
+            fresh = int(policy.progress.n_epochs) == 0
+            if fresh:
+                seed = int(np.asarray(policy.progress.key)[0])
+                prepare_statistics(self.get_vec_normalize_env(), static.twin, jax.random.key(seed))
+            normalization, params = self._normalization(static.twin), static.twin.params
+            started = partial(init_workspace, static, params, normalization, policy.progress)
+            [(workspace, scales, progress)] = run_in_threads([started], self.poll)
+            if fresh:
+                policy.networks = policy.networks._replace(inside=scales.inside)
+                progress = progress._replace(
+                    reward_scale=scales.reward_scale, reward_offset=scales.reward_offset
+                )
+            self._workspace, policy.progress = workspace, progress
+        return EpochState(policy.networks, policy.progress, workspace)
+
+    @property
+    def _epoch_config(self) -> EpochConfig:
+        """Static configuration of an epoch."""
+        return epoch_config(self.config, self.policy, require_twin(self.twin, self.twin_spec))
+
+    def hyperparams(self, twin: Twin, gradient_steps: int) -> Hyperparams:
+        """:return: the hyperparameters of the next epoch, which may change without recompiling"""
+        config, n_epochs = self.config, int(self.policy.progress.n_epochs)
+        how = config.refinements
+        return Hyperparams(
+            params=twin.params,
+            varied=self.varied(twin),
+            learning_rate=self.lr_schedule(self._progress_remaining()),
+            noise=config.exploration_noise * config.exploration_decay**n_epochs,
+            temperature=config.temperature * _TEMPERATURE_DECAY**n_epochs,
+            reset_share=config.reset_share,
+            gain_weight=how.gain_weight,
+            sensitivity_weight=how.sensitivity_weight,
+            averaging=how.averaging,
+            gradient_steps=gradient_steps,
+            vec_normalize=self._normalization(twin),
+        )
+
+    def varied(self, twin: Twin) -> Params:
+        """
+        :return: parameters that differ between the rollouts of an epoch, each of shape
+            ``(n_rollouts,)``
+        """
+        config = self.config
+        if not config.randomisation:
+            return {}
+        drawn = {}
+        for name, parameter in twin.parameters.items():
+            deviation = config.randomisation * parameter.scale * np.random.randn(config.n_rollouts)
+            values = np.clip(twin.values[name] + deviation, parameter.lower, parameter.upper)
+            drawn[name] = jnp.asarray(values, jnp.float32)
+        return drawn
+
+    def _normalization(self, twin: Twin) -> Any:
+        return normalization_of(self.get_vec_normalize_env(), len(twin.channels))
+
+    @property
+    def comparison_due(self) -> bool:
+        """Whether policies are compared after this epoch regardless of ``compare_every``."""
+        return False
+
+    @property
+    def was_compared(self) -> bool:
+        """Whether policies were compared after an earlier epoch."""
+        every = self.config.refinements.compare_every
+        return every > 0 and int(self.policy.progress.n_epochs) >= every
+
+    def _progress_remaining(self) -> float:
+        """From 1 to 0 over the planning epochs of this call of ``learn``, pretraining included."""
+        if not self._epochs_planned:
+            return 1.0
+        return max(0.0, 1.0 - self._epochs_done / self._epochs_planned)
+
+    def remedies(self, updates_per_step: float) -> list[str]:
+        n = self.config.n_rollouts
+        return [
+            f"n_rollouts={max(1, n // 4)}, {n} now",
+            "a larger train_freq",
+            f"fewer gradient_steps, {updates_per_step:.3g} for each step now",
+            "a GPU",
+        ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()
@@ -378,7 +388,8 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
             "twin",
             "_workspace",
             "_compiled",
-            "_comparison",
+            "_comparison_compiles",
+            "_comparison_is_compiled",
             "poll",
             "stopped",
             "unstored_step",

@@ -32,20 +32,17 @@ def choose_policy(
     config: EpochConfig,
     state: EpochState,
     hyper: Hyperparams,
-    every: int,
     due: bool,
     was_compared: bool,
 ) -> tuple[EpochState, Float[np.ndarray, " 2"] | None]:
     """
     After an epoch: the averaged policy acts until the first comparison, then the better one does.
 
-    :param every: epochs between two comparisons; 0: no comparisons
-    :param due: compare after this epoch in any case, unless ``every`` is 0
+    :param due: whether policies are compared after this epoch, see :func:`is_compared`
     :param was_compared: whether there was a comparison after an earlier epoch
     :return: the state, and the returns of a comparison, see :func:`keep_better`
     """
-    n_epochs = int(state.progress.n_epochs)
-    if is_compared(n_epochs, every, due):
+    if due:
         return keep_better(config, state, hyper)
     if was_compared:
         return state, None
@@ -54,9 +51,13 @@ def choose_policy(
     return state._replace(networks=acting), None
 
 
-def is_compared(n_epochs: int, every: int, due: bool) -> bool:
-    """:return: whether policies are compared after this number of epochs"""
-    return every > 0 and (due or n_epochs % every == 0)
+def is_compared(n_epochs: int, every: int, anyway: bool) -> bool:
+    """
+    :param every: epochs between two comparisons; 0: no comparisons
+    :param anyway: compare after each epoch, unless ``every`` is 0
+    :return: whether policies are compared after this number of epochs
+    """
+    return every > 0 and (anyway or n_epochs % every == 0)
 
 
 def comparison(config: EpochConfig, state: EpochState, hyper: Hyperparams) -> Callable[[], Any]:
