@@ -435,6 +435,19 @@ def test_a_step_that_no_callback_saw_stored_ends_with_its_episode(no_planning):
     assert model.measured.trajectories().lengths.tolist() == [6, 6]
 
 
+def test_a_step_that_was_counted_and_never_stored_changes_no_number_of_a_recording(no_planning):
+    model = real(refit_freq=0)
+
+    counted = lambda: len(model.measured.recordings())  # noqa: E731
+
+    model.learn(25, callback=lambda *_: bool(counted()) and model.num_timesteps < 7)
+    model.learn(0)
+    assert counted() == 1
+    model.learn(25)
+
+    assert model.measured.recordings().origin.tolist() == [0, 1]
+
+
 def test_a_step_that_is_not_stored_yet_leaves_the_oldest_one_in_a_full_buffer(no_planning):
     model = real(refit_freq=0, buffer_size=10).learn(13)
     before = columns(model)["observations"].copy()

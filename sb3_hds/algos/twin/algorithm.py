@@ -173,7 +173,7 @@ class TwinAlgorithm(OffPolicyTensorAlgorithm):
         before = self._last_obs
         total_timesteps, callback = super()._setup_learn(total_timesteps, *args, **kwargs)
         if self._last_obs is not before:
-            # The environment was reset, and the step before led elsewhere.
+            # The environment was reset: the step did not begin where the next one does.
             self.unstored_step = None
         steps = total_timesteps - self.num_timesteps
         self._epochs_planned = self.pretraining_due + math.ceil(steps / self._steps_per_epoch)

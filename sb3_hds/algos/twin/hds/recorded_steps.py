@@ -262,7 +262,8 @@ class Recordings:
 
     def n_steps(self, buffer: Any) -> int:
         """:return: steps of each environment that were added so far, overwritten ones included"""
-        since = (buffer.pos - self._position) % buffer.buffer_size
+        # -1: the last step was counted before it was stored, and never was.
+        since = (buffer.pos + 1 - self._position) % buffer.buffer_size - 1
         return max(self._n_steps + since, buffer.size())
 
     @property
