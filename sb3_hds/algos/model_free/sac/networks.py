@@ -99,15 +99,13 @@ class Mlp(nn.Module):
 
     :param net_arch: widths of the layers
     :param activation_fn: of each layer
-    :param dropout_rate: DroQ's; 0: no dropout
+    :param dropout_rate: DroQ's, always on (``train`` concerns batch normalisation); 0: no dropout
     :param layer_norm: DroQ's, after the dropout
     :param renorm_warmup_steps: CrossQ's: updates of plain batch normalisation before batch
         renormalisation; None: neither
     :param momentum: of the running statistics of batch normalisation
     :param ortho_init: whether kernels start orthogonal with a gain of the square root of 2, rather
         than normal with a gain of 1
-
-    The argument ``train`` of a call concerns batch normalisation: dropout is always on.
     """
 
     net_arch: Sequence[int]

@@ -197,15 +197,14 @@ def update_once(
             obs=normalize(state.obs_stats, batch.obs),
             next_obs=normalize(state.obs_stats, batch.next_obs),
         )
-    critics = partial(update_critics, config, batch, hyper)
     actor = partial(update_actor, config, batch, hyper)
-    target = partial(soft_update, hyper.tau)
     steps = [
-        UpdateStep(("critic",), 1, critics),
+        UpdateStep(("critic",), 1, partial(update_critics, config, batch, hyper)),
         UpdateStep(("actor", "log_ent_coef", "extra"), config.policy_delay, actor),
     ]
     if not config.joint_pass:
-        steps.append(UpdateStep(("target",), config.target_update_interval, target))
+        average = partial(soft_update, hyper.tau)
+        steps.append(UpdateStep(("target",), config.target_update_interval, average))
     return apply_schedule(state, metrics, *steps)
 
 
@@ -243,9 +242,8 @@ def update_critics(
 
     loss_and_gradient = jax.value_and_grad(loss, has_aux=True)
     (value, weights), gradient = loss_and_gradient(state.critic.weights["params"])
-    critic = config.qf_optimizer.apply(
-        gradient, TrainState(weights, state.critic.optimizer), hyper.qf_learning_rate
-    )
+    critic = TrainState(weights, state.critic.optimizer)
+    critic = config.qf_optimizer.apply(gradient, critic, hyper.qf_learning_rate)
     return (critic,), metrics._replace(critic_loss=value)
 
 
@@ -282,11 +280,10 @@ def update_actor(
 
     loss_and_gradient = jax.value_and_grad(loss, has_aux=True)
     (value, (entropy, weights)), gradient = loss_and_gradient(state.actor.weights["params"])
-    actor = config.optimizer.apply(
-        gradient, TrainState(weights, state.actor.optimizer), hyper.learning_rate
-    )
+    actor = TrainState(weights, state.actor.optimizer)
+    actor = config.optimizer.apply(gradient, actor, hyper.learning_rate)
     log_ent_coef, excess = state.log_ent_coef, entropy - hyper.target_entropy
-    linear = config.linear_ent_coef
+    linear, extra = config.linear_ent_coef, state.extra
     metrics = metrics._replace(
         actor_loss=value,
         ent_coef=ent_coef,
@@ -295,7 +292,6 @@ def update_actor(
     if config.learns_ent_coef:
         gradient = excess * ent_coef if linear else excess
         log_ent_coef = config.ent_coef_optimizer.apply(gradient, log_ent_coef, hyper.learning_rate)
-    extra = state.extra
     if config.extra is not None:
         now = state._replace(actor=actor, log_ent_coef=log_ent_coef)
         extra = config.extra.update(config, now, batch, hyper, extra_key)
