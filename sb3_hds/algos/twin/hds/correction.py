@@ -206,7 +206,7 @@ def _corrected(
 ) -> Correction:
     """
     :param nominal: the twin before any data
-    :param current: the twin that was planned in so far, without its learned force
+    :param current: the twin that was planned in so far; its errors are those without learned force
     """
     nominal, current, config, added = _add_suspects(nominal, current, config)
     fit = _calibrated(nominal.twin, current.twin, windows, config)
