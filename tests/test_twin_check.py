@@ -10,7 +10,15 @@ from free_mass import Mass
 from test_twin_contract import broken
 
 from sb3_hds import twins
-from sb3_hds.core import Parameter, State, TransformedTwin, Twin, rk4, semi_implicit_euler
+from sb3_hds.core import (
+    AnalyticTwin,
+    Parameter,
+    State,
+    TransformedTwin,
+    Twin,
+    rk4,
+    semi_implicit_euler,
+)
 from sb3_hds.core.transforms.filters import Delay
 from sb3_hds.effects import CoulombFriction, SensorBias
 from sb3_hds.twins.mechanics import Points, check_mechanics
@@ -28,7 +36,7 @@ def test_every_twin_passes(name):
     found = twins.check(name)
     assert found.ok, found
     energy = [item for item in found.items if item.name in ("mass matrix", "energy")]
-    assert len(energy) == 2
+    assert len(energy) == 2 * issubclass(twins.get(name), AnalyticTwin)
 
 
 class Cart(Mass):

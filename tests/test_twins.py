@@ -13,7 +13,7 @@ from cases import each
 from jax.flatten_util import ravel_pytree
 
 from sb3_hds import effects, twins
-from sb3_hds.core import ExtendedTwin
+from sb3_hds.core import AnalyticTwin, ExtendedTwin
 from sb3_hds.errors import ParameterError
 
 # Every twin that has a name, and one that is made of a model file.
@@ -149,8 +149,10 @@ def test_the_derivative_of_a_step_equals_a_finite_difference(twin, x64):
     for seed in range(3):
         difference, derivative = forward(random_like(here, seed))
         # Central differences over 3e-6: truncation 1e-11 and rounding 3e-11, times derivatives of
-        # up to 1e4, for dry friction changes direction within 0.01.
-        np.testing.assert_allclose(flat(derivative), flat(difference), rtol=1e-6, atol=1e-6)
+        # up to 1e4, for dry friction changes direction within 0.01. Engines take one-sided ones
+        # over 1e-6, which are off by half of that times the curvature.
+        error = 1e-6 if isinstance(twin, AnalyticTwin | ExtendedTwin) else 3e-4
+        np.testing.assert_allclose(flat(derivative), flat(difference), rtol=error, atol=error)
 
 
 @every_twin
@@ -234,8 +236,12 @@ def damping_of(twin):
 
 
 # All but the payload's, whose drive makes up for the damping that it knows of, and those of model
-# files, which take it at the end of a step.
-DAMPED = [twin for twin in PLAIN[:-1] if damping_of(twin) and twin.name != "PayloadPendulum"]
+# files and engines, which take it at the end of a step.
+DAMPED = [
+    twin
+    for twin in PLAIN[:-1]
+    if isinstance(twin, AnalyticTwin) and damping_of(twin) and twin.name != "PayloadPendulum"
+]
 
 
 @pytest.mark.parametrize("twin", DAMPED, **name_of)

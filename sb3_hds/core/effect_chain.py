@@ -94,6 +94,11 @@ class EffectChain:
         return both
 
     @property
+    def is_empty(self) -> bool:
+        """:return: whether there is neither a force nor an action effect"""
+        return not (self._actions or self._forces)
+
+    @property
     def has_forces(self) -> bool:
         """:return: whether any effect acts in the equation of motion"""
         return bool(self._forces)

@@ -5,6 +5,7 @@ Every improver is a function ``(problem, start, first, ...)`` on one trajectory,
 safe under ``jit`` and ``vmap``; :func:`solve` batches one over many start states.
 """
 
+from sb3_hds.planning.controller import MPC, mpc
 from sb3_hds.planning.expansion import Expansion, expand
 from sb3_hds.planning.ilqr import Gains, gauss_newton, ilqr, newton_direction, solve_backward
 from sb3_hds.planning.line_search import choose, control_gradient, gradient_ascent, step_sizes
@@ -21,6 +22,7 @@ from sb3_hds.planning.solve import (
 
 __all__ = [
     "METHODS",
+    "MPC",
     "Expansion",
     "Gains",
     "Plan",
@@ -34,6 +36,7 @@ __all__ = [
     "gradient_ascent",
     "horizon_continuation",
     "ilqr",
+    "mpc",
     "multi_start",
     "newton_direction",
     "random_controls",

@@ -12,7 +12,20 @@ from sb3_hds.twins.environments.mountain_car import MountainCar
 from sb3_hds.twins.environments.payload_pendulum import PayloadPendulum
 from sb3_hds.twins.environments.pendulum import Pendulum
 from sb3_hds.twins.environments.pendulum_real import PendulumReal
-from sb3_hds.twins.mujoco import MechanismTwin, Written, from_mujoco, write_model, write_models
+from sb3_hds.twins.locomotion.ant import Ant
+from sb3_hds.twins.locomotion.half_cheetah import HalfCheetah
+from sb3_hds.twins.locomotion.hopper import Hopper
+from sb3_hds.twins.locomotion.reacher import Reacher
+from sb3_hds.twins.locomotion.swimmer import Swimmer
+from sb3_hds.twins.locomotion.walker2d import Walker2d
+from sb3_hds.twins.mujoco import (
+    ContactTwin,
+    MechanismTwin,
+    Written,
+    from_mujoco,
+    write_model,
+    write_models,
+)
 from sb3_hds.twins.registry import all_ids, from_env, from_spec, get, make, names, register
 from sb3_hds.twins.rigs.double_pendulum import DoublePendulum
 from sb3_hds.twins.rigs.duffing import Duffing
@@ -24,12 +37,16 @@ from sb3_hds.twins.rigs.servo_pendulum import ServoPendulum
 
 __all__ = [
     "Acrobot",
+    "Ant",
     "CartPole",
     "CheckItem",
+    "ContactTwin",
     "DoublePendulum",
     "Duffing",
     "FreePendulum",
     "Furuta",
+    "HalfCheetah",
+    "Hopper",
     "InvertedDoublePendulum",
     "InvertedPendulum",
     "InvertedPendulumFriction",
@@ -39,9 +56,12 @@ __all__ = [
     "PayloadPendulum",
     "Pendulum",
     "PendulumReal",
+    "Reacher",
     "Rig",
     "ServoPendulum",
+    "Swimmer",
     "TwinCheck",
+    "Walker2d",
     "Written",
     "all_ids",
     "check",
@@ -59,4 +79,4 @@ __all__ = [
 for _name in __all__:
     _twin = globals()[_name]
     if isinstance(_twin, type) and issubclass(_twin, Twin) and hasattr(_twin, "name"):
-        register(_twin, listed=_twin is not MechanismTwin)
+        register(_twin, listed=_twin not in (ContactTwin, MechanismTwin))

@@ -10,6 +10,7 @@ from sb3_hds.core.contract import check_methods
 from sb3_hds.core.numerics.compilation import cache_compiled_programs
 from sb3_hds.effects import ALL, effect_named
 from sb3_hds.errors import CalibrationError, EffectError
+from sb3_hds.sysid.checks.engine import refuse_engine
 from sb3_hds.sysid.diagnosis.pipeline import EFFORTS, Inquiry
 from sb3_hds.sysid.estimation.parameters import Belief
 from sb3_hds.sysid.measurements import check_fits
@@ -55,7 +56,7 @@ def diagnose(
     :param progress: whether a bar shows how far it is, with an estimate of the time left
     :return: verdict, findings, what was rejected, what cannot be told apart, the extended twin
     :raises CalibrationError: for other channels or another interval than the twin's, or an unknown
-        name in ``calibrate``
+        name in ``calibrate``, or a twin on MuJoCo's engine
     :raises EffectError: for an unknown effect, or a twin whose step does not use effects
     :raises TwinError: for a twin whose methods do not return what they have to
     :raises TrajectoryError: if no recording is long enough
@@ -67,6 +68,7 @@ def diagnose(
         )
     twin = twin.member(0) if isinstance(twin, BeliefTwin) else twin
     check_methods(twin)
+    refuse_engine(twin, "diagnose")
     cache_compiled_programs()
     check_fits(twin, data)
     if budget not in EFFORTS:

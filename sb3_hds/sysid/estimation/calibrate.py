@@ -11,6 +11,7 @@ from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.core.numerics.compilation import cache_compiled_programs
 from sb3_hds.errors import CalibrationError
+from sb3_hds.sysid.checks.engine import refuse_engine
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.inverse_dynamics import (
@@ -86,12 +87,13 @@ def calibrate(
     :param seed: of the choice of windows
     :return: estimates with standard errors and units, and the calibrated twin
     :raises CalibrationError: for an unknown or missing parameter, other channels or another
-        interval than the twin's, fewer measurements than unknowns, or forces of a twin that is no
-        ``AnalyticTwin``
+        interval than the twin's, fewer measurements than unknowns, forces of a twin that is no
+        ``AnalyticTwin``, or a twin on MuJoCo's engine
     :raises TrajectoryError: if no recording is as long as a window
     :raises TwinError: for a twin whose methods do not return what they have to
     """
     check_methods(twin)
+    refuse_engine(twin, "calibrate")
     cache_compiled_programs()
     wanted = tie(twin, free_names(twin, free), tied or {})
     check_fits(twin, data)

@@ -1,5 +1,6 @@
 """Twins of robots from their model files."""
 
+from sb3_hds.twins.mujoco.engine.contact_twin import ContactTwin
 from sb3_hds.twins.mujoco.files.writing import Written, write_model, write_models
 from sb3_hds.twins.mujoco.from_mujoco import from_mujoco
 from sb3_hds.twins.mujoco.matching import Matching, arranged, match
@@ -7,6 +8,7 @@ from sb3_hds.twins.mujoco.mechanism import Mechanism
 from sb3_hds.twins.mujoco.twin import MechanismTwin
 
 __all__ = [
+    "ContactTwin",
     "Matching",
     "Mechanism",
     "MechanismTwin",

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from sb3_hds.errors import ModelFileError, ParameterError, did_you_mean
+from sb3_hds.twins.mujoco.engine.contact_twin import ContactTwin
 from sb3_hds.twins.mujoco.files.load import load
 from sb3_hds.twins.mujoco.files.reading import integrator_of, n_actuators, read
 from sb3_hds.twins.mujoco.files.refusals import refuse
@@ -31,16 +32,18 @@ def from_mujoco(
     reward: Reward | None = None,
     terminated: Terminated | None = None,
     ignore: Collection[str] = (),
-) -> MechanismTwin:
+) -> MechanismTwin | ContactTwin:
     """
-    A twin of a model that MuJoCo can load, without contacts.
+    A twin of a model that MuJoCo can load: in JAX, without contacts, or on MuJoCo's own engine.
 
     Parameters have the names of the file: ``elbow_damping``, ``elbow_frictionloss``,
     ``elbow_armature``, ``elbow_servo_kp``.
 
     :param model_or_path_or_env: path or text of an MJCF or URDF file (meshes may be missing where
         inertials are given), an ``MjSpec`` or ``MjModel``, or a MuJoCo environment of Gymnasium
-    :param engine: ``"smooth"``, or ``"auto"``, which is the same
+    :param engine: ``"smooth"``: rigid bodies without contacts in JAX, which everything of the
+        package takes; ``"mujoco"``: MuJoCo's own engine with contacts, limits, tendons and
+        equality constraints, for planning and learning; ``"auto"``: the same as ``"smooth"``
     :param actuators: for a model without actuators, or to replace them: ``"torque"`` (default for a
         URDF) for a motor at each hinge and slide, within its effort limit; or a mapping such as
         ``{"kind": "position", "kp": 20.0, "kv": 1.5}``, whose commands are targets. A value is one
@@ -59,12 +62,18 @@ def from_mujoco(
     :raises ModelFileError: for a file that cannot be read, or unsupported features of the model
     :raises ParameterError: for invalid actuators, integrator or payload
     """
-    if engine not in ("auto", "smooth"):
-        raise ParameterError(
-            "engine must be 'smooth' or 'auto': MuJoCo's own engine, with contacts, is not a twin "
-            f"yet; got {engine!r}. If there are no contacts in the data, pass ignore=['contacts']."
-        )
+    if engine not in ("auto", "smooth", "mujoco"):
+        raise ParameterError(f"engine must be 'smooth', 'mujoco' or 'auto', got {engine!r}.")
     loaded = load(model_or_path_or_env)
+    if engine == "mujoco":
+        if actuators is not None or integrator is not None or payload is not None or masses:
+            raise ParameterError(
+                "actuators, integrator, payload and masses are for engine='smooth'. Write them "
+                "into the model; on MuJoCo's engine, masses are parameters anyway."
+            )
+        dt = loaded.dt if dt is None else dt
+        task: Any = {"reward": reward, "terminated": terminated}
+        return ContactTwin(loaded.model, observe=observe, dt=dt, **task)
     if integrator is None:
         integrator = "implicitfast" if loaded.urdf else integrator_of(loaded.model)
     ignore = (ignore,) if isinstance(ignore, str) else tuple(ignore)

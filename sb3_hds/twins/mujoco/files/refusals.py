@@ -40,7 +40,8 @@ def _ignorable(model: Any) -> dict[str, str]:
     touching = contacts(model)
     if touching:
         found["contacts"] = (
-            f"Contacts can happen ({first_names(touching)}), which the twin does not simulate."
+            f"Contacts can happen ({first_names(touching)}), which the twin does not simulate "
+            "(engine='mujoco' does)."
         )
     if _enabled(model, "EQUALITY") and model.neq and np.any(model.eq_active0):
         active = [

@@ -1,0 +1,1 @@
+"""Twins of Gymnasium's MuJoCo tasks, on MuJoCo's engine."""

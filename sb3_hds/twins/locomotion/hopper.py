@@ -1,0 +1,95 @@
+"""Twin of Gymnasium's ``Hopper-v5``."""
+
+import jax.numpy as jnp
+
+from sb3_hds.core import Actuator, Channel, Joint, State
+from sb3_hds.core.types import Action, Flag, Params, Scalar
+from sb3_hds.twins.locomotion.task import MujocoTask, inside, margin
+from sb3_hds.twins.mujoco.engine.values import declared
+
+_LEG = ("thigh_joint", "leg_joint", "foot_joint")
+# Width of the soft limits of the planning reward.
+_HEIGHT, _ANGLE = 0.05, 0.04  # [m], [rad]
+
+
+class Hopper(MujocoTask):
+    r"""
+    A leg of three links under a torso, in the plane. It ends when the torso is too low or tilts.
+
+    .. math:: r = w\,(x' - x) / \Delta t + h\,[\text{healthy}] - c\,|u|^2
+
+    with :math:`w = h = 1` and :math:`c` = 1e-3. Healthy: the torso is above 0.7 m
+    (``healthy_z_range``), tilts by less than 0.2 rad (``healthy_angle_range``), and all other
+    numbers of the state are below 100 in size (``healthy_state_range``).
+
+    The observation clips velocities to 10, so :meth:`infer` does not recover faster ones. Planning
+    replaces the indicator by a product of logistic functions of height and angle, 1/2 at the
+    limits.
+    """
+
+    name = "Hopper"
+    env_id = "Hopper-v5"
+    dt = 0.008
+    substeps = 4
+    max_episode_steps = 1000
+    max_speed = 10.0
+    options = {
+        "xml_file": "hopper.xml",
+        "forward_reward_weight": 1.0,
+        "ctrl_cost_weight": 1e-3,
+        "healthy_reward": 1.0,
+        "terminate_when_unhealthy": True,
+        "healthy_state_range": (-100.0, 100.0),
+        "healthy_z_range": (0.7, float("inf")),
+        "healthy_angle_range": (-0.2, 0.2),
+        "reset_noise_scale": 5e-3,
+        "exclude_current_positions_from_observation": True,
+    }
+    forward_reward_weight: float
+    ctrl_cost_weight: float
+    healthy_reward: float
+    terminate_when_unhealthy: bool
+    healthy_state_range: tuple[float, float]
+    healthy_z_range: tuple[float, float]
+    healthy_angle_range: tuple[float, float]
+    joints = (Joint("rootx", "m"), Joint("rootz", "m"), Joint("rooty"), *map(Joint, _LEG))
+    positions = tuple(Channel(f"{joint.name}_position", joint.unit) for joint in joints)
+    actuators = tuple(Actuator(joint, "1", -1.0, 1.0) for joint in _LEG)
+    parameters = declared(
+        masses={
+            "torso": 3.6651914291880923,
+            "thigh": 4.057890510886818,
+            "leg": 2.7813566959781637,
+            "foot": 5.315574769873931,
+        },
+        damping=dict.fromkeys(_LEG, 1.0),
+        motors=_LEG,
+    )
+    native_effects = {
+        **{("viscous_friction", i): {"b": f"{joint}_damping"} for i, joint in enumerate(_LEG, 3)},
+        **{("torque_gain", i): {"gain": f"{joint}_gain"} for i, joint in enumerate(_LEG)},
+    }
+
+    def healthy(self, state: State) -> Flag:
+        rest = jnp.concatenate([state.q[2:], state.v])
+        fine = jnp.all(inside(rest, *self.healthy_state_range))
+        height = inside(state.q[1], *self.healthy_z_range)
+        return fine & height & inside(state.q[2], *self.healthy_angle_range)
+
+    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        alive = self.healthy_reward * self.healthy(next_state)
+        return self._moving(state, action, next_state) + alive
+
+    def planning_reward(
+        self, state: State, action: Action, next_state: State, params: Params
+    ) -> Scalar:
+        height = margin(next_state.q[1], *self.healthy_z_range, _HEIGHT)
+        upright = margin(next_state.q[2], *self.healthy_angle_range, _ANGLE)
+        return self._moving(state, action, next_state) + self.healthy_reward * height * upright
+
+    def _moving(self, state: State, action: Action, next_state: State) -> Scalar:
+        speed = (next_state.q[0] - state.q[0]) / self.dt
+        return self.forward_reward_weight * speed - self.ctrl_cost_weight * jnp.sum(action**2)
+
+    def terminated(self, state: State, params: Params) -> Flag:
+        return ~self.healthy(state) & bool(self.terminate_when_unhealthy)

@@ -1,0 +1,57 @@
+"""Twin of Gymnasium's ``Swimmer-v5``."""
+
+import jax.numpy as jnp
+
+from sb3_hds.core import Actuator, Channel, Joint, State
+from sb3_hds.core.types import Action, Params, Scalar
+from sb3_hds.twins.locomotion.task import MujocoTask
+from sb3_hds.twins.mujoco.engine.values import declared
+
+_MOTORS = ("motor1_rot", "motor2_rot")
+
+
+class Swimmer(MujocoTask):
+    r"""
+    A chain of three links in a viscous medium, seen from above.
+
+    .. math:: r = w\,(x' - x) / \Delta t - c\,|u|^2
+
+    with :math:`w` = 1 and :math:`c` = 1e-4. There is no termination.
+    """
+
+    name = "Swimmer"
+    env_id = "Swimmer-v5"
+    dt = 0.04
+    substeps = 4
+    max_episode_steps = 1000
+    n_excluded = 2
+    options = {
+        "xml_file": "swimmer.xml",
+        "forward_reward_weight": 1.0,
+        "ctrl_cost_weight": 1e-4,
+        "reset_noise_scale": 0.1,
+        "exclude_current_positions_from_observation": True,
+    }
+    forward_reward_weight: float
+    ctrl_cost_weight: float
+    joints = (
+        Joint("slider1", "m"),
+        Joint("slider2", "m"),
+        Joint("free_body_rot"),
+        *map(Joint, _MOTORS),
+    )
+    positions = tuple(Channel(f"{joint.name}_position", joint.unit) for joint in joints)
+    actuators = tuple(Actuator(motor, "1", -1.0, 1.0) for motor in _MOTORS)
+    parameters = declared(
+        masses=dict.fromkeys(("torso", "mid", "back"), 35.604716740684324),
+        damping=dict.fromkeys(_MOTORS, 0.0),
+        motors=_MOTORS,
+    )
+    native_effects = {
+        **{("viscous_friction", i): {"b": f"{m}_damping"} for i, m in enumerate(_MOTORS, 3)},
+        **{("torque_gain", i): {"gain": f"{motor}_gain"} for i, motor in enumerate(_MOTORS)},
+    }
+
+    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        speed = (next_state.q[0] - state.q[0]) / self.dt
+        return self.forward_reward_weight * speed - self.ctrl_cost_weight * jnp.sum(action**2)

@@ -1,0 +1,95 @@
+"""Twin of Gymnasium's ``Walker2d-v5``."""
+
+import jax.numpy as jnp
+
+from sb3_hds.core import Actuator, Channel, Joint, State
+from sb3_hds.core.types import Action, Flag, Params, Scalar
+from sb3_hds.twins.locomotion.task import MujocoTask, inside, margin
+from sb3_hds.twins.mujoco.engine.values import declared
+
+_RIGHT = ("thigh_joint", "leg_joint", "foot_joint")
+_LEGS = (*_RIGHT, "thigh_left_joint", "leg_left_joint", "foot_left_joint")
+# Width of the soft limits of the planning reward.
+_HEIGHT, _ANGLE = 0.05, 0.1  # [m], [rad]
+
+
+class Walker2d(MujocoTask):
+    r"""
+    Two legs of three links under a torso, in the plane. It ends when the torso is too low, too high
+    or tilts.
+
+    .. math:: r = w\,(x' - x) / \Delta t + h\,[\text{healthy}] - c\,|u|^2
+
+    with :math:`w = h = 1` and :math:`c` = 1e-3. Healthy: the torso is between 0.8 and 2 m high
+    (``healthy_z_range``) and tilts by less than 1 rad (``healthy_angle_range``).
+
+    The observation clips velocities to 10, so :meth:`infer` does not recover faster ones. Planning
+    replaces the indicator by a product of logistic functions of height and angle, 1/2 at the
+    limits.
+    """
+
+    name = "Walker2d"
+    env_id = "Walker2d-v5"
+    dt = 0.008
+    substeps = 4
+    max_episode_steps = 1000
+    max_speed = 10.0
+    options = {
+        "xml_file": "walker2d_v5.xml",
+        "forward_reward_weight": 1.0,
+        "ctrl_cost_weight": 1e-3,
+        "healthy_reward": 1.0,
+        "terminate_when_unhealthy": True,
+        "healthy_z_range": (0.8, 2.0),
+        "healthy_angle_range": (-1.0, 1.0),
+        "reset_noise_scale": 5e-3,
+        "exclude_current_positions_from_observation": True,
+    }
+    forward_reward_weight: float
+    ctrl_cost_weight: float
+    healthy_reward: float
+    terminate_when_unhealthy: bool
+    healthy_z_range: tuple[float, float]
+    healthy_angle_range: tuple[float, float]
+    joints = (Joint("rootx", "m"), Joint("rootz", "m"), Joint("rooty"), *map(Joint, _LEGS))
+    positions = tuple(Channel(f"{joint.name}_position", joint.unit) for joint in joints)
+    actuators = tuple(Actuator(joint, "1", -1.0, 1.0) for joint in _LEGS)
+    parameters = declared(
+        masses={
+            "torso": 3.6651914291880923,
+            "thigh": 4.057890510886818,
+            "leg": 2.7813566959781637,
+            "foot": 3.1667253948185117,
+            "thigh_left": 4.057890510886818,
+            "leg_left": 2.7813566959781637,
+            "foot_left": 3.1667253948185117,
+        },
+        damping=dict.fromkeys(_LEGS, 0.1),
+        motors=_LEGS,
+    )
+    native_effects = {
+        **{("viscous_friction", i): {"b": f"{joint}_damping"} for i, joint in enumerate(_LEGS, 3)},
+        **{("torque_gain", i): {"gain": f"{joint}_gain"} for i, joint in enumerate(_LEGS)},
+    }
+
+    def healthy(self, state: State) -> Flag:
+        height = inside(state.q[1], *self.healthy_z_range)
+        return height & inside(state.q[2], *self.healthy_angle_range)
+
+    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        alive = self.healthy_reward * self.healthy(next_state)
+        return self._moving(state, action, next_state) + alive
+
+    def planning_reward(
+        self, state: State, action: Action, next_state: State, params: Params
+    ) -> Scalar:
+        height = margin(next_state.q[1], *self.healthy_z_range, _HEIGHT)
+        upright = margin(next_state.q[2], *self.healthy_angle_range, _ANGLE)
+        return self._moving(state, action, next_state) + self.healthy_reward * height * upright
+
+    def _moving(self, state: State, action: Action, next_state: State) -> Scalar:
+        speed = (next_state.q[0] - state.q[0]) / self.dt
+        return self.forward_reward_weight * speed - self.ctrl_cost_weight * jnp.sum(action**2)
+
+    def terminated(self, state: State, params: Params) -> Flag:
+        return ~self.healthy(state) & bool(self.terminate_when_unhealthy)

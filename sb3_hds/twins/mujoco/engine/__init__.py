@@ -1,0 +1,1 @@
+"""MuJoCo's own engine, contacts included, as a twin."""
