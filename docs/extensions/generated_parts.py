@@ -114,6 +114,8 @@ PARTS: dict[str, Callable[[], str]] = {
         "diagnosis_cost", "seconds of a diagnosis against the number of recordings"
     ),
     "model_files": summaries.complete("model_files"),
+    "locomotion": summaries.complete("locomotion"),
+    "locomotion_cost": summaries.complete("locomotion_cost"),
     "joints_cost": summaries.complete("joints_cost"),
     "cluster_overhead": summaries.complete("cluster_overhead"),
     "start_up": summaries.complete("start_up_summary"),
