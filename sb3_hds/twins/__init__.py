@@ -15,6 +15,7 @@ from sb3_hds.twins.environments.pendulum_real import PendulumReal
 from sb3_hds.twins.locomotion.ant import Ant
 from sb3_hds.twins.locomotion.half_cheetah import HalfCheetah
 from sb3_hds.twins.locomotion.hopper import Hopper
+from sb3_hds.twins.locomotion.pusher import Pusher
 from sb3_hds.twins.locomotion.reacher import Reacher
 from sb3_hds.twins.locomotion.swimmer import Swimmer
 from sb3_hds.twins.locomotion.walker2d import Walker2d
@@ -56,6 +57,7 @@ __all__ = [
     "PayloadPendulum",
     "Pendulum",
     "PendulumReal",
+    "Pusher",
     "Reacher",
     "Rig",
     "ServoPendulum",
