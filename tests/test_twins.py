@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 from sb3_hds import effects, twins
 from sb3_hds.core import AnalyticTwin, ExtendedTwin
 from sb3_hds.errors import ParameterError
+from sb3_hds.twins.mujoco.engine.twin import EngineTwin
 
 # Every twin that has a name, and one that is made of a model file.
 PLAIN = [twins.make(name) for name in twins.names()] + [
@@ -92,13 +93,17 @@ def test_an_episode_starts_alive_within_bounds_and_is_drawn_as_a_line_that_moves
 
     obs, sketches, over, again = jax.tree.map(np.asarray, seen(starts))
 
-    assert not over.any() and np.ptp(starts.q[:, 0]) > 0.0
+    assert not over.any() and np.ptp(starts.q, 0).max() > 0.0
     assert np.all(obs >= [channel.low for channel in twin.channels])
     assert np.all(obs <= [channel.high for channel in twin.channels])
     assert sketches.ndim == 3 and sketches.shape[2] == 2 and np.isfinite(sketches).all()
     moving = twin.sketch(a_state(twin), twin.params)
     assert not np.allclose(moving, sketches[0])
-    np.testing.assert_allclose(flat(again), flat(starts), rtol=0.0, atol=1e-14)  # one rounding
+    # What an engine has read belongs to no tangent.
+    parts = 2 if isinstance(twin, EngineTwin) else 3
+    np.testing.assert_allclose(
+        flat(again[:parts]), flat(starts[:parts]), 0.0, 1e-14
+    )  # one rounding
 
 
 @each(twins.make("InvertedDoublePendulum"), PLAIN[-1], EXTENDED, **name_of)
@@ -150,8 +155,11 @@ def test_the_derivative_of_a_step_equals_a_finite_difference(twin, x64):
         difference, derivative = forward(random_like(here, seed))
         # Central differences over 3e-6: truncation 1e-11 and rounding 3e-11, times derivatives of
         # up to 1e4, for dry friction changes direction within 0.01. Engines take one-sided ones
-        # over 1e-6, which are off by half of that times the curvature.
-        error = 1e-6 if isinstance(twin, AnalyticTwin | ExtendedTwin) else 3e-4
+        # over 1e-6, with an error of half of that times the curvature, large where contacts begin.
+        error = 1e-6
+        if isinstance(twin, EngineTwin):
+            # Derivatives of what an engine reads are those of its next state.
+            difference, derivative, error = difference[0], derivative[0], 1e-2
         np.testing.assert_allclose(flat(derivative), flat(difference), rtol=error, atol=error)
 
 

@@ -81,14 +81,11 @@ class Pusher(MujocoTask):
     positions = tuple(Channel(f"{joint.name}_position", joint.unit) for joint in joints)
     actuators = tuple(Actuator(joint, "N m", -2.0, 2.0) for joint in _ARM)
     parameters = declared(
-        masses={"r_upper_arm_link": 1.6286016316209488, "object": 7.853981633974484e-06},
-        damping={
-            **dict(zip(_ARM, (1.0, 1.0, 0.1, 0.1, 0.1, 0.1, 0.1), strict=True)),
-            **dict.fromkeys(_SLIDES[:2], 0.5),
-        },
+        masses={"r_upper_arm_link": 1.6286016316209488},
+        damping=dict(zip(_ARM, (1.0, 1.0, 0.1, 0.1, 0.1, 0.1, 0.1), strict=True)),
         motors=_ARM,
-        gravity=0.0,
-        sliding=_SLIDES,
+        gravity=None,
+        friction=False,
     )
     native_effects = {
         **{("viscous_friction", i): {"b": f"{joint}_damping"} for i, joint in enumerate(_ARM)},

@@ -59,6 +59,8 @@ class Reacher(MujocoTask):
         masses=dict.fromkeys(("body0", "body1"), 0.03560471674068432),
         damping=dict.fromkeys(_ARM, 1.0),
         motors=_ARM,
+        gravity=None,
+        friction=False,
     )
     native_effects = {
         **{("viscous_friction", i): {"b": f"{joint}_damping"} for i, joint in enumerate(_ARM)},

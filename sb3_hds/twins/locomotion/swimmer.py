@@ -46,6 +46,8 @@ class Swimmer(MujocoTask):
         masses=dict.fromkeys(("torso", "mid", "back"), 35.604716740684324),
         damping=dict.fromkeys(_MOTORS, 0.0),
         motors=_MOTORS,
+        gravity=None,
+        friction=False,
     )
     native_effects = {
         **{("viscous_friction", i): {"b": f"{m}_damping"} for i, m in enumerate(_MOTORS, 3)},

@@ -22,7 +22,8 @@ def declared(
     masses: Mapping[str, float] = {},
     damping: Mapping[str, float] = {},
     motors: Iterable[str] = (),
-    gravity: float = 9.81,
+    gravity: float | None = 9.81,
+    friction: bool = True,
     sliding: Iterable[str] = (),
 ) -> dict[str, Parameter]:
     """
@@ -31,15 +32,13 @@ def declared(
     :param masses: by body [kg]; its inertia changes in proportion
     :param damping: by hinge or slide
     :param motors: actuators that have a gain, 1 for the model's own
-    :param gravity: downwards [m/s2]
+    :param gravity: downwards [m/s2]; None where it has no effect
+    :param friction: whether that of contacts has an effect
     :param sliding: joints of ``damping`` that are slides
-    :return: ``gravity``, ``friction`` (the factor on all coefficients of sliding friction),
-        ``<body>_mass``, ``<joint>_damping`` and ``<actuator>_gain``
+    :return: ``<body>_mass``, ``<joint>_damping``, ``<actuator>_gain``, ``gravity`` and
+        ``friction``, the factor on all coefficients of sliding friction
     """
-    found = {
-        GRAVITY: Parameter(gravity, 0.5, "m/s2", 0.0),
-        FRICTION: Parameter(1.0, 0.2, "1", 0.0),
-    }
+    found = {}
     for body, mass in masses.items():
         found[f"{body}_mass"] = Parameter(mass, _OF_ITSELF * mass, "kg", _LEAST_MASS)
     for joint, value in damping.items():
@@ -48,6 +47,10 @@ def declared(
         found[f"{joint}_damping"] = Parameter(value, scale, unit, 0.0)
     for motor in motors:
         found[f"{motor}_gain"] = Parameter(1.0, _OF_ITSELF, "1")
+    if gravity is not None:
+        found[GRAVITY] = Parameter(gravity, 0.5, "m/s2", min(gravity, 0.0))
+    if friction:
+        found[FRICTION] = Parameter(1.0, 0.2, "1", 0.0)
     return found
 
 
