@@ -4,15 +4,22 @@ import dataclasses
 import os
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from free_mass import Mass
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_hds import planning, twins
 from sb3_hds.core import State
+from sb3_hds.envs import TwinEnv
+from sb3_hds.errors import ParameterError
 from sb3_hds.planning import Problem
 
 HORIZON = 12
@@ -308,3 +315,50 @@ def test_receding_horizon_comes_near_the_known_optimum_of_pendulum():
     regret = float(np.mean(table["R"][rows] - np.asarray(plans.value)))
     # An independent implementation of the same planner reached -145.8 where the optimum is -137.4.
     assert -0.5 < regret < 12.0
+
+
+def test_model_predictive_control_is_a_policy_for_one_environment_or_several():
+    env = gymnasium.wrappers.TimeLimit(TwinEnv("Pendulum"), 60)
+    policy = planning.mpc(env.unwrapped.twin, horizon=25, replan_every=3, n_random_plans=8)
+
+    def actions_of(rows, **settings):
+        fresh = planning.mpc(env.unwrapped.twin, horizon=15, **settings)
+        return np.stack([fresh.predict(rows)[0] for _ in range(3)])
+
+    rows = np.float32([[1.0, 0.0, 0.5], [0.0, 1.0, -0.5]])
+    together = actions_of(rows, n_random_plans=1)
+    assert together.shape == (3, 2, 1) and together.dtype == np.float32
+    assert actions_of(rows[0]).shape == (3, 1)
+    # Near the upright position it pushes back, and against the same state always alike.
+    assert together[0, 0, 0] < 0.0
+    np.testing.assert_array_equal(together, actions_of(rows, n_random_plans=1))
+
+    def returns_of(policy):
+        env.reset(seed=1)
+        return np.array(evaluate_policy(policy, Monitor(env), 2, return_episode_rewards=True)[0])
+
+    idle = SimpleNamespace(predict=lambda obs, **_: (np.zeros((len(obs), 1)), None))
+    assert (returns_of(policy) > 0.6 * returns_of(idle)).all()
+    assert policy.n_plans == 2 * 60 // 3
+
+
+def test_a_new_episode_begins_with_a_new_plan():
+    policy = planning.mpc(twins.make("Pendulum"), horizon=10, replan_every=10)
+    start = np.array([True])
+    for k, begun in enumerate((True, False, False, True, False)):
+        policy.predict(np.float32([[1.0, 0.0, 0.0]]), episode_start=start & begun)
+        assert policy.n_plans == 1 + (k >= 3)
+
+
+@each(
+    ({"horizon": 0}, "horizon must be a whole number of at least 1, got 0"),
+    ({"n_iterations": 1.5}, "n_iterations must be a whole number"),
+    ({"horizon": 5, "replan_every": 6}, "between 1 and the horizon, 5, got 6"),
+    ({"method": "cem"}, "method must be one of first_order, gauss_newton, ilqr, got 'cem'"),
+    ({"discount": 0.0}, "discount must be above 0"),
+)
+def test_model_predictive_control_refuses(settings, message):
+    with pytest.raises(ParameterError, match=message):
+        planning.mpc(twins.make("Pendulum"), **settings)
+    with pytest.raises(ValueError, match=r"Pendulum observes 3 channels, got .*\(2,\)"):
+        planning.mpc(twins.make("Pendulum")).predict(np.zeros(2))

@@ -16,6 +16,7 @@ from sb3_hds.twins.mujoco.engine.values import declared
 
 _LEGS = tuple(f"{part}_{i}" for i in range(1, 5) for part in ("hip", "ankle"))
 _MOTORS = (*_LEGS[6:], *_LEGS[:6])
+_TORSO = (1, "torso")
 _N_BODIES = 14  # the world first
 _WRENCH = ("torque_x", "torque_y", "torque_z", "force_x", "force_y", "force_z")
 _HEIGHT = 0.03  # width of the soft limits of the planning reward [m]
@@ -116,6 +117,8 @@ class Ant(MujocoTask):
         return {"place": (_place(self.main_body), 2), "contact": (_contact, 6 * _N_BODIES)}
 
     def at(self, q: Position, v: Array) -> State:
+        if self.main_body not in _TORSO:
+            return self.look(State(q, v, {}))
         nothing = jnp.zeros(6 * _N_BODIES, q.dtype)
         return self.with_readings(State(q, v, {}), place=q[:2], contact=nothing)
 
@@ -126,7 +129,7 @@ class Ant(MujocoTask):
             return state
         observed = obs[-6 * (_N_BODIES - 1) :]
         contact = jnp.concatenate([jnp.zeros(6, obs.dtype), observed])
-        return self.with_readings(state, place=state.q[:2], contact=contact)
+        return self.with_readings(state, place=self.reading(state, "place"), contact=contact)
 
     def observe(self, state: State, params: Params) -> Obs:
         obs = super().observe(state, params)

@@ -123,6 +123,21 @@ class Simulator:
         """As :meth:`linearise`, by applied forces and parameters too."""
         return self._linearise(rows, more=True)
 
+    def look(self, rows: np.ndarray) -> np.ndarray:
+        """:return: the readings at a state that was set, without a step: ``(n, n_readings)``"""
+        mj, found = mujoco(), np.full((len(rows), self.layout.n_readings), np.nan)
+        with self._lock:
+            self._start()
+            for i in np.flatnonzero(np.isfinite(rows).all(1)):
+                q, v, _, _, values = self._parts(rows[i])
+                model, data = self._model(values), self._datas[0]
+                mj.mj_resetData(model, data)
+                data.qpos[:], data.qvel[:] = q, v
+                mj.mj_forward(model, data)
+                read = [reading(data).ravel() for reading in self.readings]
+                found[i] = np.concatenate(read)
+        return found
+
     def terms(self, rows: np.ndarray) -> np.ndarray:
         """
         :return: mass matrix, row by row, then the generalised forces of gravity, inertia and

@@ -24,7 +24,7 @@ from sb3_hds.core.types import (
     Tangent,
     Velocity,
 )
-from sb3_hds.twins.mujoco.engine.host import on_host
+from sb3_hds.twins.mujoco.engine.host import Function, on_host
 from sb3_hds.twins.mujoco.engine.simulator import Reading, Simulator
 from sb3_hds.twins.mujoco.engine.values import Values
 from sb3_hds.twins.mujoco.library import mujoco
@@ -139,10 +139,8 @@ class EngineTwin(Twin):
 
     def _terms(self, row: "_Row") -> tuple[MassMatrix, Force, Force]:
         """Mass matrix, load and actuator force, without derivatives."""
-        simulator, n = self._interval(1).simulator, len(row.v)
-        call = jax.custom_jvp(lambda flat: on_host(simulator.terms, n * n + 2 * n, flat))
-        call.defjvp(lambda at, _: (found := call(*at), jnp.zeros_like(found)))
-        found = call(jax.lax.stop_gradient(row.flat()))
+        n = len(row.v)
+        found = _without_derivative(self._interval(1).terms, n * n + 2 * n, row)
         return found[: n * n].reshape(n, n), found[n * n : n * n + n], found[n * n + n :]
 
     # --- readings
@@ -155,6 +153,16 @@ class EngineTwin(Twin):
                 return state.memory[_READ][at : at + size]
             at += size
         raise KeyError(name)
+
+    def look(self, state: State) -> State:
+        """:return: a state that was not simulated, with what the engine reads there at once"""
+        values = self._values(state, dict(self.values))
+        still = jnp.zeros(len(self.actuators), state.q.dtype)
+        row = _Row(state.q, state.v, still, jnp.zeros_like(state.v), values)
+        interval = self._interval(self.substeps)
+        size = interval.simulator.layout.n_readings
+        read = _without_derivative(interval.look, size, row)
+        return state._replace(memory=state.memory | {_READ: read})
 
     def with_readings(self, state: State, **readings: Float[Array, " n"]) -> State:
         """:return: the state with its readings, all of them, set"""
@@ -220,10 +228,14 @@ class _Interval(NamedTuple):
 
     :param simulator: that computes it
     :param call: a row to position, velocity and readings
+    :param terms: of the simulator; the same object for all programs
+    :param look: likewise
     """
 
     simulator: Simulator
     call: Callable[[_Row], tuple[Position, Velocity, Memory]]
+    terms: Function
+    look: Function
 
     def __call__(self, row: _Row) -> tuple[Position, Velocity, Memory]:
         return self.call(row)
@@ -321,7 +333,13 @@ def _interval(
         )
 
     call.defjvp(derivative, symbolic_zeros=True)
-    return _Interval(simulator, lambda row: call(*row))
+    return _Interval(simulator, lambda row: call(*row), simulator.terms, simulator.look)
+
+
+def _without_derivative(function: Function, size: int, row: _Row) -> Array:
+    call = jax.custom_jvp(lambda flat: on_host(function, size, flat))
+    call.defjvp(lambda at, _: (found := call(*at), jnp.zeros_like(found)))
+    return call(jax.lax.stop_gradient(row.flat()))
 
 
 def _dense(change: Any) -> Array:

@@ -12,7 +12,7 @@ from sb3_hds.twins.mujoco.library import mujoco
 
 _OF_ITSELF = 0.1  # typical deviation, as a share of the value
 _LEAST_DAMPING = 0.1  # typical deviation of the damping of a joint without any [N m s/rad]
-_LEAST_MASS = 1e-6  # [kg]
+_LEAST_MASS = 0.1  # as a share of the value: below, contacts and joint limits are too stiff
 
 GRAVITY = "gravity"
 FRICTION = "friction"
@@ -40,7 +40,7 @@ def declared(
     """
     found = {}
     for body, mass in masses.items():
-        found[f"{body}_mass"] = Parameter(mass, _OF_ITSELF * mass, "kg", _LEAST_MASS)
+        found[f"{body}_mass"] = Parameter(mass, _OF_ITSELF * mass, "kg", _LEAST_MASS * mass)
     for joint, value in damping.items():
         unit = "N s/m" if joint in set(sliding) else "N m s/rad"
         scale = max(_OF_ITSELF * value, _LEAST_DAMPING)
