@@ -377,7 +377,7 @@ FILTER = '<general name="slow" joint="j0" dyntype="filter" dynprm="0.1"/>'
     (robots.chain(1, actuator="none", drives=FILTER), {}, "internal dynamics (slow)"),
     (robots.chain(1, option='integrator="implicit"'), {}, "integrator 'implicit' is"),
     (robots.chain(1), {"ignore": "wind"}, "ignore takes contacts, equality"),
-    (robots.chain(1), {"engine": "engine"}, "engine must be 'smooth' or 'auto'"),
+    (robots.chain(1), {"engine": "engine"}, "engine must be 'smooth', 'mujoco' or 'auto'"),
     (robots.chain(1), {"actuators": "servo"}, "actuators is one of 'torque'"),
     (robots.chain(1), {"payload": "tpi"}, "no site or body 'tpi'"),
     ("arm.xml", {}, "There is no file 'arm.xml'"),

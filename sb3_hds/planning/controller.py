@@ -27,7 +27,7 @@ class MPC:
     It has a plan for each copy of the environment, so one object serves one loop at a time. A new
     episode has to be announced by ``episode_start``, as SB3's ``evaluate_policy`` does.
 
-    :param twin: to plan in; its values and those of ``params`` are used as they are
+    :param twin: to plan in
     :param horizon: steps of a plan
     :param replan_every: steps of a plan that are executed
     :param settings: of the planner: method, number of iterations, discount, number of random plans
@@ -47,7 +47,7 @@ class MPC:
         self._key = jax.random.key(seed)
         self._plans: np.ndarray | None = None  # (n_envs, horizon, n_act), from the next step on
         self._left = 0
-        #: controls planned so far, one for each step of each copy
+        #: plans made so far, over all copies
         self.n_plans = 0
 
     def predict(
