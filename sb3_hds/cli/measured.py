@@ -209,7 +209,8 @@ def _twin_of_model(
         for name, value in given.items()
         if name not in options
     }
-    return from_mujoco(path, **options, **model_options).with_parameters(**values)
+    made: Any = from_mujoco(path, **options, **model_options)
+    return made.with_parameters(**values)
 
 
 def _model_and_data(given: argparse.Namespace) -> "tuple[MechanismTwin, Trajectories]":

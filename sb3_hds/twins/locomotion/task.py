@@ -9,10 +9,10 @@ from typing import Any, ClassVar, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sb3_hds.core import Channel, State
-from sb3_hds.core.types import Flag, Obs, Params, Position, Scalar
+from sb3_hds.core.types import Obs, Params, Position, Scalar
 from sb3_hds.errors import EnvironmentMismatchError, ModelFileError
 from sb3_hds.twins.mujoco.engine.twin import EngineTwin, Source
 from sb3_hds.twins.mujoco.engine.values import Values
@@ -45,8 +45,9 @@ class MujocoTask(EngineTwin):
 
     def __init__(self, **settings: Any) -> None:
         # Plain data may have lists in place of tuples.
-        hashable = {n: tuple(x) if isinstance(x, list) else x for n, x in settings.items()}
-        super().__init__(**hashable)
+        for name, value in settings.items():
+            settings[name] = tuple(value) if isinstance(value, list) else value
+        super().__init__(**settings)
         self.channels = self._channels()
 
     def _channels(self) -> tuple[Channel, ...]:
@@ -173,7 +174,7 @@ def seen(read: Float[Array, "..."], own: Float[Array, "..."]) -> Float[Array, ".
     return own + jax.lax.stop_gradient(read - own)
 
 
-def inside(x: Scalar, low: float, high: float) -> Flag:
+def inside(x: Float[Array, "..."], low: float, high: float) -> Bool[Array, "..."]:
     return (x > low) & (x < high)
 
 

@@ -22,7 +22,7 @@ Function: TypeAlias = Callable[[np.ndarray], np.ndarray]
 Row: TypeAlias = Float[Array, " n"]
 
 
-def on_host(function: Function, size: int, row: Row) -> Row:
+def on_host(function: Function, size: int, row: Row) -> Float[Array, " size"]:
     """
     Call a function of NumPy from a compiled program. Under ``vmap``, all rows go in one call.
 

@@ -84,7 +84,8 @@ class Simulator:
         nominal.opt.tolerance = _TOLERANCE
         self._values = Values(nominal, values.names)
         self.scales, self.timestep, self.n_steps = scales, timestep, n_steps
-        # Later than the end of an interval that begins at zero, as after a reset by MuJoCo.
+        # Time at the start. Where numbers are too large, MuJoCo resets data to time zero, and the
+        # interval ends before this.
         self._begin = 2.0 * n_steps * timestep
         self.readings = tuple(readings)
         self.layout = Layout(nominal.nq, nominal.nv, nominal.nu, len(values.names), n_readings)
@@ -99,7 +100,8 @@ class Simulator:
         self._n_state = mj.mj_stateSize(nominal, self._state)
         self._models: dict[bytes, Any] = {}
         self._lock, self._process = threading.Lock(), 0
-        self._pool, self._threads = None, None
+        self._pool: Any = None
+        self._threads: ThreadPoolExecutor | None = None
         self._abandoned: list[Any] = []
         self._start()
 
@@ -218,7 +220,7 @@ class Simulator:
         )
         end = states[:, -1]
         out[:, : nq + nv] = end[:, 1 : 1 + nq + nv]
-        out[self._was_reset(end[:, 0])] = np.nan
+        out[end[:, 0] < self._begin] = np.nan
 
     def _differences(self, rows: np.ndarray, n_columns: int) -> np.ndarray:
         """One-sided differences of intervals, all in one batch."""
@@ -305,7 +307,7 @@ class Simulator:
             found = reading(data).ravel()
             out[at : at + len(found)] = found
             at += len(found)
-        if self._was_reset(np.array(data.time)):
+        if data.time < self._begin:
             out[: self.layout.n_out] = np.nan
 
     def _parts(self, row: np.ndarray) -> list[np.ndarray]:
@@ -314,9 +316,9 @@ class Simulator:
 
     # --- models, threads
 
-    def _finite(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _finite(self, rows: np.ndarray) -> tuple[np.ndarray, Any]:
         """Rows with zeros in place of those that are not finite, and which rows are."""
-        fine = np.isfinite(rows).all(1)
+        fine = np.all(np.isfinite(rows), axis=1)
         if fine.all():
             return rows, fine
         rows = rows.copy()
@@ -325,10 +327,6 @@ class Simulator:
             self._values.read(self._values.nominal).values()
         )
         return rows, fine
-
-    def _was_reset(self, time: np.ndarray) -> np.ndarray:
-        """Whether MuJoCo reset the data on the way, because a number was too large."""
-        return time < self._begin
 
     def _models_of(self, rows: np.ndarray) -> list[Any]:
         n = self.layout.n_values

@@ -164,7 +164,7 @@ class EngineTwin(Twin):
         read = _without_derivative(interval.look, size, row)
         return state._replace(memory=state.memory | {_READ: read})
 
-    def with_readings(self, state: State, **readings: Float[Array, " n"]) -> State:
+    def with_readings(self, state: State, **readings: Array) -> State:
         """:return: the state with its readings, all of them, set"""
         read = jnp.concatenate([readings[name] for name in self.readings()])
         return state._replace(memory=state.memory | {_READ: read.astype(state.q.dtype)})
@@ -344,7 +344,8 @@ def _without_derivative(function: Function, size: int, row: _Row) -> Array:
 
 def _dense(change: Any) -> Array:
     if isinstance(change, SymbolicZero):
-        return jnp.zeros(change.aval.shape, change.aval.dtype)
+        like: Any = change.aval
+        return jnp.zeros(like.shape, like.dtype)
     return change
 
 
