@@ -45,7 +45,9 @@ def end():
 threading.Thread(target=end, daemon=True).start()
 name = f"{algo} {env} {seed}"
 with open(ledger, "a") as file: file.write("begun " + name + "\\n")
-folder = pathlib.Path(logs, algo, env.replace("/", "-") + "_1"); folder.mkdir(parents=True)
+name_of_env = env.replace("/", "-")
+folder = pathlib.Path(logs, algo, name_of_env + "_1"); (folder / name_of_env).mkdir(parents=True)
+(folder / name_of_env / "command.txt").write_text(" ".join(sys.orig_argv[3:]))
 pathlib.Path(clock).write_text("timesteps,seconds\\n0,0.0\\n")
 for i in range(5):
     time.sleep(float(moment) / 5)
@@ -88,7 +90,7 @@ def test_a_study_is_the_product_of_its_lists(tmp_path):
         ({"budgett": 1}, "Did you mean 'budget'"),
         ({"budget": {}}, "lacks 'budget'"),
         ({"budget": {"steps": -3}}, "steps must be a number above 0"),
-        ({"budget": {"steps": "many"}}, "steps must be a number above 0"),
+        ({"budget": {"steps": "many"}}, "steps must be a number above 0, or file"),
         ({"evaluation": {"often": 3}}, "takes every, episodes"),
         ({"algorithms": [{"label": "x"}]}, "lacks 'algo'"),
         ({"algorithms": [{"label": "Wide", "algo": "droq"}]}, "lower case"),
@@ -108,9 +110,25 @@ def test_the_zoo_command_contains_all_settings(tmp_path):
     )
 
     text = " ".join(words)
-    assert "--algo droq --env sb3_hds/PayloadPendulum-v0 --seed 1 -n 400" in text
+    assert "--algo droq --env sb3_hds/PayloadPendulum-v0 --seed 1 -f" in text
+    assert "-n 400" in text
     assert "--eval-freq 100 --eval-episodes 3 -params tau:0.1 --env-kwargs mass:2.0" in text
     assert words[4] == "0.5" and words[5].endswith("last") and words[6] == "5.0"
+
+
+def test_steps_may_be_those_of_the_hyperparameter_file_and_environments_of_one_algorithm(tmp_path):
+    own = {"algo": "hds", "envs": ["InvertedPendulum-v5"]}
+    study = study_of(tmp_path, algorithms=[own, "droq"], budget={"steps": "file"}, seeds=1)
+
+    words = zoo_command(study)(study.runs[0], *map(tmp_path.joinpath, ("logs", "clock", "last")))
+
+    assert [str(run.place.parent / run.env_name) for run in study.runs] == [
+        "hds/InvertedPendulum-v5",
+        "droq/Pendulum-v1",
+        "droq/sb3_hds-PayloadPendulum-v0",
+    ]
+    # Without a number, the zoo trains for n_timesteps of the file.
+    assert "-n" not in words and study.settings(study.runs[0])["steps"] == "file"
 
 
 def test_an_interval_between_checkpoints_is_not_negative(tmp_path):
@@ -128,6 +146,18 @@ def test_runs_are_complete_or_not_there_and_none_is_run_twice(tmp_path):
     assert ledger.read_text().count("through") == 8
     told = json.loads((folder / "droq_wide" / "Pendulum-v1_2" / "study.json").read_text())
     assert told["settings"]["hyperparams"] == {"tau": 0.1} and told["versions"]["jax"]
+
+
+def test_a_complete_run_names_the_folder_as_the_user_did_and_no_other_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    study = study_of(tmp_path, envs=["Pendulum-v1"], seeds=1)
+
+    run_study(study, "logs/small", command=writer(Path("ledger")), tell=lambda _: None)
+
+    place = tmp_path / "logs" / "small" / "hds" / "Pendulum-v1_1"
+    told = json.loads((place / "study.json").read_text())["command"]
+    assert told[0] == "python" and told[3:5] == ["logs/small", "logs/small/clock.csv"]
+    assert (place / "Pendulum-v1" / "command.txt").read_text().startswith("logs/small ")
 
 
 def test_a_study_that_is_killed_at_any_moment_goes_on(tmp_path):
@@ -216,7 +246,6 @@ def evaluated(tmp_path, monkeypatch):
             results=curve[:, None] + np.array([[-1.0, 0.0, 1.0]]),
         )
         config = folder / run.place / run.env_name
-        config.mkdir()
         (config / "config.yml").write_text(f"- - gamma\n  - 0.98 # {run.label}\n")
     return study, folder
 

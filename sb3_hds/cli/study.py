@@ -91,7 +91,7 @@ def _status(study: "Study", folder: Path, given: argparse.Namespace) -> int:
     progress = progress_of(study, folder)
     table = Table("algorithm", "environment", "seed", "state", "steps", "wall time", box=None)
     for row in progress:
-        share = f"{row.steps:,}" + (f" of {study.steps:,}" if study.steps else "")
+        share = f"{row.steps:,}" + (f" of {study.steps:,}" if isinstance(study.steps, int) else "")
         run = row.run
         table.add_row(run.label, run.env, str(run.seed), row.state, share, _time(row.seconds))
     Console().print(table)

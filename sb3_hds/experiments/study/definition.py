@@ -6,15 +6,17 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import yaml
 
 from sb3_hds.errors import StudyError, did_you_mean
 
 _KEYS = ("name", "algorithms", "envs", "seeds", "budget", "evaluation")
-_ALGORITHM = ("label", "algo", "hyperparams")
+_ALGORITHM = ("label", "algo", "hyperparams", "envs")
 _ENV = ("id", "kwargs")
+# Instead of a number of steps: n_timesteps of the hyperparameter file.
+_OF_FILE = "file"
 
 
 class Run(NamedTuple):
@@ -54,7 +56,8 @@ class Study:
     """
     :param name: of the study
     :param runs: of all algorithms, environments and seeds
-    :param steps: limit per run; None: no limit
+    :param steps: limit per run; ``"file"``: ``n_timesteps`` of the algorithm's hyperparameter file;
+        None: no limit
     :param minutes: limit per run; None: no limit
     :param every: steps between evaluations
     :param episodes: per evaluation
@@ -62,7 +65,7 @@ class Study:
 
     name: str
     runs: tuple[Run, ...]
-    steps: int | None
+    steps: int | Literal["file"] | None
     minutes: float | None
     every: int
     episodes: int
@@ -92,8 +95,11 @@ class Study:
         numbers["episodes"] = evaluation.get("episodes", 10)
         for key, value in numbers.items():
             kinds = int | float if key == "minutes" else int
-            if value is not None and not (isinstance(value, kinds) and value > 0):
-                raise StudyError(f"{key} must be a number above 0, got {value!r}.")
+            if value is None or (key == "steps" and value == _OF_FILE):
+                continue
+            if not (isinstance(value, kinds) and value > 0):
+                or_file = f", or {_OF_FILE}" if key == "steps" else ""
+                raise StudyError(f"{key} must be a number above 0{or_file}, got {value!r}.")
         return cls(name=str(content.get("name", file.stem)), runs=_runs(content), **numbers)
 
     def settings(self, run: Run) -> dict[str, Any]:
@@ -113,11 +119,12 @@ def zoo_command(study: Study, every: float = 5.0) -> Command:
         raise StudyError(f"Minutes between checkpoints must be 0 or more, got {every:g}.")
 
     def command(run: Run, logs: Path, clock: Path, checkpoint: Path) -> list[str]:
-        steps = study.steps or 2**31 - 1
         found = [sys.executable, "-m", "rl_zoo_plugin.study_worker", str(clock)]
         found += [repr(float(study.minutes or 0.0)), str(checkpoint), repr(float(every))]
         found += ["--algo", run.algo, "--env", run.env]
-        found += ["--seed", str(run.seed), "-n", str(steps), "-f", str(logs), "--verbose", "0"]
+        found += ["--seed", str(run.seed), "-f", str(logs), "--verbose", "0"]
+        if study.steps != _OF_FILE:  # which the zoo reads otherwise
+            found += ["-n", str(study.steps or 2**31 - 1)]
         found += ["--eval-freq", str(study.every), "--eval-episodes", str(study.episodes)]
         for option, given in (("-params", run.hyperparams), ("--env-kwargs", run.env_kwargs)):
             if given:
@@ -149,7 +156,7 @@ def _runs(content: Mapping[str, Any]) -> tuple[Run, ...]:
         label = str(entry.get("label", entry["algo"]))
         if label != label.lower() or "/" in label:
             raise StudyError(f"A label names a folder of the zoo, in lower case, got '{label}'.")
-        for given_env in content["envs"]:
+        for given_env in entry.get("envs") or content["envs"]:
             env: dict[str, Any] = {"id": given_env} if isinstance(given_env, str) else given_env
             _check_keys("an entry of envs", env, _ENV, ("id",))
             for seed in seeds:

@@ -278,7 +278,7 @@ pre { overflow-x: auto; font-size: 80% }
 </style></head><body>
 <h1>{{ study.name }}</h1>
 <p>{{ n_runs }} of {{ study.runs | length }} runs are complete.
-{% if study.steps %}{{ "{:,}".format(study.steps) }} steps each{% endif %}
+{% if study.steps is number %}{{ "{:,}".format(study.steps) }} steps each{% endif %}
 {% if study.minutes %}{{ study.minutes }} minutes each, at most{% endif %};
 {{ study.episodes }} episodes every {{ "{:,}".format(study.every) }} steps.</p>
 <h2>Final returns</h2>

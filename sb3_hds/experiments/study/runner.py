@@ -13,8 +13,9 @@ import platform
 import secrets
 import shutil
 import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -30,6 +31,8 @@ MARK = "study.json"
 #: table of steps and times in the folder of a run
 CLOCK = "clock.csv"
 _RUNNING, _FAILED, _LOCK, _CHECKPOINTS = ".running", ".failed", ".lock", ".checkpoints"
+# Files in which the zoo records its command.
+_TOLD = ("args.yml", "command.txt")
 # Characters to show of an error.
 _SHOWN = 600
 
@@ -89,7 +92,13 @@ def run_study(
     """
     root = Path(folder).resolve()
     root.mkdir(parents=True, exist_ok=True)
-    one = partial(_run_one, study=study, root=root, command=command or zoo_command(study))
+    one = partial(
+        _run_one,
+        study=study,
+        root=root,
+        shown=os.fspath(folder),
+        command=command or zoo_command(study),
+    )
     with _locked(root):
         waiting = [run for run in study.runs if not is_complete(study, run, root)]
         shutil.rmtree(root / _RUNNING, ignore_errors=True)
@@ -184,8 +193,12 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def _run_one(run: Run, study: Study, root: Path, command: Command) -> str | None:
-    """Run one run; return its error, or None."""
+def _run_one(run: Run, study: Study, root: Path, shown: str, command: Command) -> str | None:
+    """
+    Run one run; return its error, or None.
+
+    :param shown: the folder of the study, as the user wrote it
+    """
     if not (root / _LOCK).exists():
         return (
             f"{platform.node()} cannot access '{root}': a cluster needs a folder that all of its "
@@ -217,9 +230,14 @@ def _run_one(run: Run, study: Study, root: Path, command: Command) -> str | None
         return error.strip() or f"it exited with {code} and wrote nothing"
     if clock.exists():
         clock.replace(found[0] / CLOCK)
+    # The scratch folder vanishes, and other machines have other paths.
+    paths = dict.fromkeys(map(str, (logs, scratch, root)), shown) | {sys.executable: "python"}
+    for file in (found[0] / run.env_name / name for name in _TOLD):
+        if file.exists():
+            write_bytes(file, _replaced(file.read_text(), paths).encode())
     mark = {
         "settings": study.settings(run),
-        "command": words,
+        "command": [_replaced(word, paths) for word in words],
         "begun": begun,
         "seconds": time.time() - begun,
         "machine": {"cpu": _processor(), "cores": os.cpu_count(), "system": platform.platform()},
@@ -235,6 +253,12 @@ def _run_one(run: Run, study: Study, root: Path, command: Command) -> str | None
     shutil.rmtree(checkpoint, ignore_errors=True)
     _error_file(root, run).unlink(missing_ok=True)
     return None
+
+
+def _replaced(text: str, names: Mapping[str, str]) -> str:
+    for path, name in names.items():
+        text = text.replace(path, name)
+    return text
 
 
 def _name_of(run: Run) -> str:
