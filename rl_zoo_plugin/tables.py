@@ -58,7 +58,10 @@ def _extend_manager(exp_manager: ModuleType) -> None:
 
 
 def _extend_trials(exp_manager: ModuleType, manager: Any) -> None:
-    """Trials of our algorithms know their budget of steps, and print their progress."""
+    """
+    Trials of our algorithms know their budget of steps and print their progress, may be pruned
+    before the first real step, and run again if their process dies.
+    """
     optimize, objective = manager.hyperparameters_optimization, manager.objective
 
     def is_ours(self: Any) -> bool:
@@ -67,10 +70,15 @@ def _extend_trials(exp_manager: ModuleType, manager: Any) -> None:
     @functools.wraps(optimize)
     def optimize_with_progress(self: Any) -> None:
         if is_ours(self):
+            from rl_zoo_plugin.pruning import TrialEvaluations
+            from rl_zoo_plugin.storages import shared
+
             given = self.specified_callbacks or []
             given = given if isinstance(given, list) else [given]
             bar = self.show_progress and self.n_jobs == 1
             self.specified_callbacks = [*given, _PROGRESS_BAR if bar else _PROGRESS]
+            self.storage = shared(self.storage, self.study_name)
+            exp_manager.TrialEvalCallback = TrialEvaluations  # type: ignore[attr-defined]
         optimize(self)
 
     @functools.wraps(objective)

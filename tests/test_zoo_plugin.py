@@ -177,6 +177,7 @@ class Manager:
     def __init__(self, algo, config=None, show_progress=False, n_jobs=1):
         self.algo, self.n_timesteps, self.specified_callbacks = algo, 500, ["theirs.Callback"]
         self.show_progress, self.n_jobs = show_progress, n_jobs
+        self.storage = self.study_name = None
 
     def objective(self, trial):
         return trials.budget()
