@@ -10,7 +10,13 @@ one object on ``sys.meta_path`` and imports nothing.
 import os
 import sys
 
-_TARGETS = ("rl_zoo3.utils", "rl_zoo3.hyperparams_opt", "rl_zoo3.exp_manager")
+_TARGETS = (
+    "rl_zoo3.utils",
+    "rl_zoo3.hyperparams_opt",
+    "rl_zoo3.exp_manager",
+    "huggingface_sb3.push_to_hub",
+    "huggingface_sb3.load_from_hub",
+)
 
 
 class _ZooFinder:

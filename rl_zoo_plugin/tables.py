@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rl_zoo_plugin import trials
+from rl_zoo_plugin import hub, trials
 from rl_zoo_plugin.lazy import LazyAlgorithm
 from sb3_hds.algos.registry import ALGORITHMS  # registers our environments with Gymnasium, too
 
@@ -98,5 +98,7 @@ EXTENSIONS: dict[str, Callable[[ModuleType], None]] = {
     "rl_zoo3.utils": _extend_algorithms,
     "rl_zoo3.hyperparams_opt": _extend_samplers,
     "rl_zoo3.exp_manager": _extend_manager,
+    "huggingface_sb3.push_to_hub": hub.extend_push,
+    "huggingface_sb3.load_from_hub": hub.extend_load,
 }
-"""Module of the zoo to the function that extends it, once, after it has run."""
+"""Module of the zoo or of its libraries to the function that extends it, once, after it has run."""

@@ -55,6 +55,8 @@ LIBRARIES = {
     "cli": LEARNING | TABLES,
     "rl_zoo_plugin": {"rl_zoo3", "optuna"},
     "rl_zoo_plugin/callbacks.py": {"stable_baselines3", "numpy"},
+    "rl_zoo_plugin/hub.py": {"huggingface_hub", "requests"},
+    "rl_zoo_plugin/storages.py": {"sqlalchemy"},
 }
 """What a layer, or one file of it, imports from outside; the standard library is free."""
 
