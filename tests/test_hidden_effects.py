@@ -8,7 +8,11 @@ generator and the judge of names are tested first: a wrong truth would make any 
 import dataclasses
 import json
 import os
+import shutil
+import subprocess
+import sys
 from collections import Counter
+from pathlib import Path
 
 import hidden_cases
 import hidden_effects
@@ -222,3 +226,24 @@ def test_what_shows_is_found(table):
 def test_recordings_at_standstill_are_not_identifiable(table):
     still = table[table["kind"] == "still"]
     assert len(still) and (still["verdict"] == "not_identifiable").all(), told(still)
+
+
+@hidden
+def test_cases_are_spread_over_a_ray_cluster(cluster, tmp_path):
+    # A copy of the benchmarks has a table of its own.
+    here, without = tmp_path / "benchmarks", shutil.ignore_patterns("results", ".cache")
+    shutil.copytree(Path(hidden_effects.__file__).parent, here, ignore=without)
+    few = ("--cases", "15", "--systems", "pendulum", "linear_axis", "--kinds", "null")
+    command = (sys.executable, here / "hidden_effects.py", *few, "--budget", "quick")
+
+    done = subprocess.run(
+        (*command, "--ray", cluster.address), capture_output=True, text=True, timeout=900
+    )
+
+    assert done.returncode == 0, done.stderr[-4000:]
+    rows = pd.read_csv(here / "results" / "hidden_effects_quick.csv")
+    wanted = hidden_effects.numbers(15, ["pendulum", "linear_axis"], ["null"])
+    assert sorted(zip(rows["system"], rows["case"], strict=True)) == sorted(
+        (system, case) for system, cases in wanted.items() for case in cases
+    )
+    assert len(rows) == 2 and "2 cases" in done.stdout
