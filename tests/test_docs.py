@@ -238,6 +238,8 @@ def objection(words: list[str]) -> str | None:
             return objection(before[before.index("--") + 1 :])
         case ["ray", "start" | "stop", *_]:
             return None
+        case ["sudo", "apt", "install", *_] | ["sudo", "-u", "postgres", *_]:
+            return None
     return f"unknown command {words[0]}"
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import agents
 import benchmark_results
 import catalogue
 import import_picture
@@ -40,6 +41,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "effects": catalogue.effects_as_markdown,
     "nameless": catalogue.nameless_as_markdown,
     "environments": catalogue.environments_as_markdown,
+    "trained_agents": agents.as_markdown,
     "benchmarks": lambda: benchmark_results.as_markdown(pages_by_result()),
     "pendulum": summaries.complete("pendulum"),
     "epoch_cost": summaries.complete("epoch_cost", "time and memory of an epoch against rollouts"),
