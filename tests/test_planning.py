@@ -352,7 +352,7 @@ def test_a_new_episode_begins_with_a_new_plan():
 
 @each(
     ({"horizon": 0}, "horizon must be a whole number of at least 1, got 0"),
-    ({"n_iterations": 1.5}, "n_iterations must be a whole number"),
+    ({"n_iterations": 0}, "n_iterations must be a whole number"),
     ({"horizon": 5, "replan_every": 6}, "between 1 and the horizon, 5, got 6"),
     ({"method": "cem"}, "method must be one of first_order, gauss_newton, ilqr, got 'cem'"),
     ({"discount": 0.0}, "discount must be above 0"),
