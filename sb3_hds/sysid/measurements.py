@@ -1,4 +1,7 @@
-"""Recordings beside a twin: whether they fit it, how much each channel varies, and its noise."""
+"""
+Recordings beside a twin: whether they fit it, and it can be identified from them, how much each
+channel varies, and its noise.
+"""
 
 from collections.abc import Sequence
 
@@ -7,8 +10,10 @@ from jaxtyping import Float
 
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.trajectories.episodes import same_interval
+from sb3_hds.core.twin import plant_of
 from sb3_hds.data.resampling.report import Reading
 from sb3_hds.errors import CalibrationError
+from sb3_hds.twins.mujoco.engine.twin import EngineTwin
 
 # From this ratio of two intervals on, one is taken to be in another unit.
 _OTHER_UNIT = 100.0
@@ -70,3 +75,19 @@ def check_fits(twin: Twin, data: Trajectories) -> None:
             f"columns, dt: {twin.dt:g}), or make the twin with dt={data.dt:g} (on the command "
             f"line, --set dt:{data.dt:g})."
         )
+
+
+def refuse_engine(twin: Twin, what: str) -> None:
+    """
+    :param what: the name of the function that was called
+    :raises CalibrationError: for a twin on MuJoCo's engine
+    """
+    if not isinstance(plant_of(twin), EngineTwin):
+        return
+    n_columns = 2 * len(twin.joints) + len(twin.parameters)
+    raise CalibrationError(
+        f"{what} does not take {twin.name}, a twin on MuJoCo's engine: it linearises every window "
+        f"of the data for every candidate, here by {n_columns} finite differences of each step, "
+        "which takes hours. If nothing is in contact in the data, pass "
+        "twins.from_mujoco(model, ignore=['contacts', 'limits'])."
+    )

@@ -10,10 +10,9 @@ from sb3_hds.core.contract import check_methods
 from sb3_hds.core.numerics.compilation import cache_compiled_programs
 from sb3_hds.effects import ALL, effect_named
 from sb3_hds.errors import CalibrationError, EffectError
-from sb3_hds.sysid.checks.engine import refuse_engine
 from sb3_hds.sysid.diagnosis.pipeline import EFFORTS, Inquiry
 from sb3_hds.sysid.estimation.parameters import Belief
-from sb3_hds.sysid.measurements import check_fits
+from sb3_hds.sysid.measurements import check_fits, refuse_engine
 from sb3_hds.sysid.progress import Bar
 from sb3_hds.sysid.reporting.diagnosis import Diagnosis
 

@@ -11,7 +11,6 @@ from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.contract import check_methods
 from sb3_hds.core.numerics.compilation import cache_compiled_programs
 from sb3_hds.errors import CalibrationError
-from sb3_hds.sysid.checks.engine import refuse_engine
 from sb3_hds.sysid.estimation.evidence import Evidence, portion_for
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.inverse_dynamics import (
@@ -24,7 +23,7 @@ from sb3_hds.sysid.estimation.normal_equations import Uncertainty, covariance_of
 from sb3_hds.sysid.estimation.parameters import Free, free_names, nominal_values, one_each, tie
 from sb3_hds.sysid.estimation.results import Estimate, Fit
 from sb3_hds.sysid.estimation.shooting import Shots, n_free, shots_of
-from sb3_hds.sysid.measurements import NORMAL, channel_deviations, check_fits
+from sb3_hds.sysid.measurements import NORMAL, channel_deviations, check_fits, refuse_engine
 
 # Length of a window where none is given [s], within these numbers of steps.
 _WINDOW = 0.5
