@@ -117,7 +117,7 @@ def test_a_twin_is_checked_against_the_environment_as_wrapped():
 
 @each(
     (gymnasium.make("CartPole-v1"), "continuous actions"),
-    (gymnasium.make("Swimmer-v5"), r"no twin for 'Swimmer-v5'[\s\S]*twins.register"),
+    (gymnasium.make("Humanoid-v5"), r"no twin for 'Humanoid-v5'[\s\S]*twins.register"),
     ("Pendulum-v1", r"gymnasium.Env or an SB3 VecEnv"),
     (AnySpaces(action_space=spaces.Box(-1.0, 1.0, (1, 1))), "one axis"),
     (AnySpaces(action_space=spaces.Box(-np.inf, np.inf, (1,))), "finite"),
