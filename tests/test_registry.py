@@ -109,7 +109,7 @@ def test_what_is_added_is_known_everywhere(tmp_path):
     (twins / "rigs" / "heavy_axis.py").write_text(TWIN)
     insert(
         twins / "__init__.py",
-        ("Written, from_mujoco, write_model, write_models\n", IMPORT),
+        ("names, register\n", IMPORT),
         ("__all__ = [\n", '    "HeavyAxis",\n'),
     )
 
