@@ -261,16 +261,25 @@ def _inverse(twin: Twin, samples: _Samples) -> CheckItem:
             f"{error[worst]:.1%} of its largest value",
             "infer has to put each channel back where observe took it from.",
         )
-    moved = (part[_GENERIC, :, 1:].reshape(len(obs), -1) for part in samples.states[:2])
-    parts = zip(("position", "velocity"), moved, np.split(inferred, 2, 1), strict=True)
+    moved = [part[_GENERIC, :, 1:].reshape(len(obs), -1) for part in samples.states[:2]]
+    parts = zip(
+        ("position", "velocity"), moved, np.split(inferred, [moved[0].shape[1]], 1), strict=True
+    )
     lost = [
-        f"{what} of {joint.name}"
+        f"{what} of {name}"
         for what, before, after in parts
-        for joint, b, a in zip(twin.joints, before.T, after.T, strict=True)
-        if _largest(a - b, what == "position" and joint.unit == "rad") > ROUNDING * np.abs(b).max()
+        for name, angle, b, a in zip(*_coordinates(twin, before), before.T, after.T, strict=True)
+        if _largest(a - b, what == "position" and angle) > ROUNDING * np.abs(b).max()
     ]
     found = f"observe(infer(obs)) equals obs {precision(error.max())}"
     return passed(f"{found}; infer does not recover {', '.join(lost)}" if lost else found)
+
+
+def _coordinates(twin: Twin, part: np.ndarray) -> tuple[list[str], list[bool]]:
+    """:return: names of the columns, and which are angles; those of a free body have numbers"""
+    if part.shape[1] != len(twin.joints):
+        return [f"coordinate {i}" for i in range(part.shape[1])], [False] * part.shape[1]
+    return [j.name for j in twin.joints], [j.unit == "rad" for j in twin.joints]
 
 
 def _largest(change: np.ndarray, angle: bool) -> float:
