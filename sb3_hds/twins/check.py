@@ -261,7 +261,7 @@ def _inverse(twin: Twin, samples: _Samples) -> CheckItem:
             f"{error[worst]:.1%} of its largest value",
             "infer has to put each channel back where observe took it from.",
         )
-    moved = [part[_GENERIC, :, 1:].reshape(len(obs), -1) for part in samples.states[:2]]
+    moved = [np.asarray(part[_GENERIC, :, 1:]).reshape(len(obs), -1) for part in samples.states[:2]]
     parts = zip(
         ("position", "velocity"), moved, np.split(inferred, [moved[0].shape[1]], 1), strict=True
     )
