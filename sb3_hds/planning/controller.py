@@ -1,7 +1,7 @@
 """Model-predictive control as a policy, with Stable-Baselines3's ``predict``."""
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,20 @@ _LOOKAHEAD, _SHORTEST, _LONGEST = 1.0, 20, 60
 _STEP_SIZES = 6
 
 
+class Settings(NamedTuple):
+    """
+    :param method: of improvement
+    :param n_iterations: improvements of each plan
+    :param discount: per step
+    :param n_random_plans: at the start of an episode
+    """
+
+    method: str
+    n_iterations: int
+    discount: float
+    n_random_plans: int
+
+
 class MPC:
     """
     A policy that plans in a twin, from :func:`mpc`.
@@ -30,7 +44,7 @@ class MPC:
     :param twin: to plan in
     :param horizon: steps of a plan
     :param replan_every: steps of a plan that are executed
-    :param settings: of the planner: method, number of iterations, discount, number of random plans
+    :param settings: of the planner
     :param seed: of the random plans at the start of an episode
     """
 
@@ -39,14 +53,15 @@ class MPC:
         twin: Twin,
         horizon: int,
         replan_every: int,
-        settings: tuple[str, int, float, int],
+        settings: "Settings",
         seed: int,
     ) -> None:
         self.twin, self.horizon, self.replan_every = twin, horizon, replan_every
         self._settings = settings
         self._key = jax.random.key(seed)
-        self._plans: np.ndarray | None = None  # (n_envs, horizon, n_act), from the next step on
-        self._left = 0
+        # Controls and actions of the last plans, (n_envs, horizon, n_act), and their next step.
+        self._controls: np.ndarray | None = None
+        self._actions, self._at = np.empty(0), 0
         #: plans made so far, over all copies
         self.n_plans = 0
 
@@ -74,26 +89,23 @@ class MPC:
         rows = obs.reshape(-1, obs.shape[-1])
         begun = np.zeros(len(rows), bool)
         begun |= False if episode_start is None else np.asarray(episode_start, bool).reshape(-1)
-        if self._plans is None or len(self._plans) != len(rows):
-            self._plans = np.zeros((len(rows), self.horizon, len(self.twin.actuators)))
+        if self._controls is None or len(self._controls) != len(rows):
+            self._controls = np.zeros((len(rows), self.horizon, len(self.twin.actuators)))
             begun[:] = True
-        if begun.any() or self._left == 0:
+        if begun.any() or self._at == self.replan_every:
             self._replan(rows, begun)
-        control, self._left = self._plans[:, 0], self._left - 1
-        repeated = self._plans[:, -1:]
-        self._plans = np.concatenate([self._plans[:, 1:], repeated], 1)
-        low, high = np.array([(a.low, a.high) for a in self.twin.actuators]).T
-        action = (low + 0.5 * (control + 1.0) * (high - low)).astype(np.float32)
+        action, self._at = self._actions[:, self._at], self._at + 1
         return action.reshape(*obs.shape[:-1], -1), state
 
     def _replan(self, rows: np.ndarray, begun: np.ndarray) -> None:
-        assert self._plans is not None
+        assert self._controls is not None
+        later = np.minimum(np.arange(self.horizon) + self._at, self.horizon - 1)
         self._key, key = jax.random.split(self._key)
         with jax.enable_x64(True):
-            given = (rows.astype(np.float64), self._plans, begun, key, self.twin.params)
-            plans = _improved(self.twin, self._settings, *given)
-            self._plans = np.array(plans.controls)
-        self._left = self.replan_every
+            given = (rows.astype(np.float64), self._controls[:, later], begun, key)
+            controls, actions = _improved(self.twin, self._settings, *given, self.twin.params)
+        self._controls, self._actions = np.asarray(controls), np.asarray(actions, np.float32)
+        self._at = 0
         self.n_plans += len(rows)
 
 
@@ -149,26 +161,28 @@ def mpc(
             f"Plans keep commands within their limits, and {', '.join(unbounded)} of {twin.name} "
             "has none. Give the actuators a ctrlrange."
         )
-    return MPC(twin, horizon, replan_every, (method, n_iterations, discount, n_random_plans), seed)
+    return MPC(
+        twin, horizon, replan_every, Settings(method, n_iterations, discount, n_random_plans), seed
+    )
 
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=QUICK_COMPILATION)
 def _improved(
     twin: Twin,
-    settings: tuple[str, int, float, int],
+    settings: Settings,
     obs: Float[Array, "n obs"],
     plans: Float[Array, "n horizon act"],
     begun: Any,
     key: Any,
     params: Params,
-) -> Plan:
-    method, n_iterations, discount, n_random = settings
-    problem = Problem(twin, params, discount)
+) -> tuple[Float[Array, "n horizon act"], Float[Array, "n horizon act"]]:
+    """:return: controls and actions of the plans"""
+    problem = Problem(twin, params, settings.discount)
     horizon, n_act = plans.shape[1:]
 
     def first(start: State, warm: Controls, key: Any) -> Plan:
         """The best of the shifted plan and random ones."""
-        keys = jax.random.split(key, n_random)
+        keys = jax.random.split(key, settings.n_random_plans)
         drawn = jax.vmap(lambda k: random_controls(k, horizon, n_act))(keys)
         candidates = jnp.concatenate([warm[None], drawn])
         found = jax.vmap(lambda u: simulate(problem, start, u))(candidates)
@@ -181,5 +195,8 @@ def _improved(
         lambda: jax.vmap(first)(starts, jnp.where(begun[:, None, None], 0.0, plans), keys),
         lambda: jax.vmap(lambda s, u: simulate(problem, s, u))(starts, plans),
     )
-    improve = partial(METHODS[method], n_iterations=n_iterations, n_step_sizes=_STEP_SIZES)
-    return jax.vmap(lambda s, plan: improve(problem, s, plan))(starts, warm)
+    improve = partial(
+        METHODS[settings.method], n_iterations=settings.n_iterations, n_step_sizes=_STEP_SIZES
+    )
+    controls = jax.vmap(lambda s, plan: improve(problem, s, plan).controls)(starts, warm)
+    return controls, jax.vmap(jax.vmap(problem.action))(controls)

@@ -94,7 +94,7 @@ class _Judged(NamedTuple):
 def _judge_few(search: Search, screened: Screened, start: Base, base: Base) -> _Judged:
     """
     Leave out members that held-out recordings do not need, one after the other, and exchange those
-    in whose place another candidate predicts surely better.
+    in whose place another candidate is preferred.
     """
     exchanged: dict[str, str] = {}
     members = _members(search, screened)
@@ -144,11 +144,12 @@ def _preferred(search: Search, rival: Tried, member: Candidate, base: Base) -> b
         prior odds
     """
     compare, twin = search.ranking.compare, search.hypotheses.nominal
-    more = len(rival.candidate.parameters) - len(member.parameters)
-    if more <= 0 and not as_good(compare(rival.held_out, base.held_out)):
+    if len(rival.candidate.parameters) > len(member.parameters):
+        return False
+    if not as_good(compare(rival.held_out, base.held_out)):
         return True
-    rarer = rarity_of(rival.candidate, twin) - rarity_of(member, twin)
-    return more <= 0 and rarer < 0.0 and as_good(compare(base.held_out, rival.held_out))
+    likelier = rarity_of(rival.candidate, twin) < rarity_of(member, twin)
+    return likelier and as_good(compare(base.held_out, rival.held_out))
 
 
 def _judge_many(search: Search, screened: Screened, start: Base, base: Base) -> _Judged:

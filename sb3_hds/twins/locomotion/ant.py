@@ -10,9 +10,9 @@ from jaxtyping import Array
 
 from sb3_hds.core import Actuator, Channel, Joint, State
 from sb3_hds.core.types import Action, Flag, Obs, Params, Position, Scalar
-from sb3_hds.twins.locomotion.task import MujocoTask, margin, seen
+from sb3_hds.twins.locomotion.task import HealthyTask, margin, seen
 from sb3_hds.twins.mujoco.engine.simulator import Reading
-from sb3_hds.twins.mujoco.engine.values import declared
+from sb3_hds.twins.mujoco.engine.values import declared, natives
 
 _LEGS = tuple(f"{part}_{i}" for i in range(1, 5) for part in ("hip", "ankle"))
 _MOTORS = (*_LEGS[6:], *_LEGS[:6])
@@ -34,7 +34,7 @@ def _contact(data: Any) -> np.ndarray:
     return data.cfrc_ext
 
 
-class Ant(MujocoTask):
+class Ant(HealthyTask):
     r"""
     A torso on four legs of two joints. It ends when the torso is too low or too high.
 
@@ -73,12 +73,8 @@ class Ant(MujocoTask):
         "exclude_current_positions_from_observation": True,
         "include_cfrc_ext_in_observation": True,
     }
-    forward_reward_weight: float
-    ctrl_cost_weight: float
     contact_cost_weight: float
-    healthy_reward: float
     main_body: int | str
-    terminate_when_unhealthy: bool
     healthy_z_range: tuple[float, float]
     contact_force_range: tuple[float, float]
     include_cfrc_ext_in_observation: bool
@@ -98,10 +94,7 @@ class Ant(MujocoTask):
         damping=dict.fromkeys(_LEGS, 1.0),
         motors=_MOTORS,
     )
-    native_effects = {
-        **{("viscous_friction", i): {"b": f"{joint}_damping"} for i, joint in enumerate(_LEGS, 6)},
-        **{("torque_gain", i): {"gain": f"{joint}_gain"} for i, joint in enumerate(_MOTORS)},
-    }
+    native_effects = natives(joints, actuators, parameters)
 
     def _channels(self) -> tuple[Channel, ...]:
         if not self.include_cfrc_ext_in_observation:
@@ -142,20 +135,10 @@ class Ant(MujocoTask):
         finite = jnp.isfinite(state.q).all() & jnp.isfinite(state.v).all()
         return finite & (low <= state.q[2]) & (state.q[2] <= high)
 
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        alive = self.healthy_reward * self.healthy(next_state)
-        return self._moving(state, action, next_state) + alive
+    def health(self, state: State) -> Scalar:
+        return margin(state.q[2], *self.healthy_z_range, _HEIGHT)
 
-    def planning_reward(
-        self, state: State, action: Action, next_state: State, params: Params
-    ) -> Scalar:
-        height = margin(next_state.q[2], *self.healthy_z_range, _HEIGHT)
-        return self._moving(state, action, next_state) + self.healthy_reward * height
-
-    def terminated(self, state: State, params: Params) -> Flag:
-        return ~self.healthy(state) & bool(self.terminate_when_unhealthy)
-
-    def _moving(self, state: State, action: Action, next_state: State) -> Scalar:
+    def moving(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
         places = (seen(self.reading(s, "place")[0], s.q[0]) for s in (state, next_state))
         before, after = places
         speed = (after - before) / self.dt

@@ -1,16 +1,13 @@
 """Twin of Gymnasium's ``HalfCheetah-v5``."""
 
-import jax.numpy as jnp
-
-from sb3_hds.core import Actuator, Channel, Joint, State
-from sb3_hds.core.types import Action, Params, Scalar
-from sb3_hds.twins.locomotion.task import MujocoTask
-from sb3_hds.twins.mujoco.engine.values import declared
+from sb3_hds.core import Actuator, Channel, Joint
+from sb3_hds.twins.locomotion.task import ForwardTask
+from sb3_hds.twins.mujoco.engine.values import declared, natives
 
 _LEGS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
 
 
-class HalfCheetah(MujocoTask):
+class HalfCheetah(ForwardTask):
     r"""
     A cheetah in the plane: a torso with two legs of three links, on the ground.
 
@@ -33,8 +30,6 @@ class HalfCheetah(MujocoTask):
         "reset_noise_scale": 0.1,
         "exclude_current_positions_from_observation": True,
     }
-    forward_reward_weight: float
-    ctrl_cost_weight: float
     joints = (Joint("rootx", "m"), Joint("rootz", "m"), Joint("rooty"), *map(Joint, _LEGS))
     positions = tuple(Channel(f"{joint.name}_position", joint.unit) for joint in joints)
     actuators = tuple(Actuator(leg, "1", -1.0, 1.0) for leg in _LEGS)
@@ -51,11 +46,4 @@ class HalfCheetah(MujocoTask):
         damping=dict(zip(_LEGS, (6.0, 4.5, 3.0, 4.5, 3.0, 1.5), strict=True)),
         motors=_LEGS,
     )
-    native_effects = {
-        **{("viscous_friction", i): {"b": f"{leg}_damping"} for i, leg in enumerate(_LEGS, 3)},
-        **{("torque_gain", i): {"gain": f"{leg}_gain"} for i, leg in enumerate(_LEGS)},
-    }
-
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        speed = (next_state.q[0] - state.q[0]) / self.dt
-        return self.forward_reward_weight * speed - self.ctrl_cost_weight * jnp.sum(action**2)
+    native_effects = natives(joints, actuators, parameters)

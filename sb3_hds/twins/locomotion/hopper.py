@@ -3,16 +3,16 @@
 import jax.numpy as jnp
 
 from sb3_hds.core import Actuator, Channel, Joint, State
-from sb3_hds.core.types import Action, Flag, Params, Scalar
-from sb3_hds.twins.locomotion.task import MujocoTask, inside, margin
-from sb3_hds.twins.mujoco.engine.values import declared
+from sb3_hds.core.types import Flag, Scalar
+from sb3_hds.twins.locomotion.task import HealthyTask, inside, margin
+from sb3_hds.twins.mujoco.engine.values import declared, natives
 
 _LEG = ("thigh_joint", "leg_joint", "foot_joint")
 # Width of the soft limits of the planning reward.
 _HEIGHT, _ANGLE = 0.05, 0.04  # [m], [rad]
 
 
-class Hopper(MujocoTask):
+class Hopper(HealthyTask):
     r"""
     A leg of three links under a torso, in the plane. It ends when the torso is too low or tilts.
 
@@ -45,10 +45,6 @@ class Hopper(MujocoTask):
         "reset_noise_scale": 5e-3,
         "exclude_current_positions_from_observation": True,
     }
-    forward_reward_weight: float
-    ctrl_cost_weight: float
-    healthy_reward: float
-    terminate_when_unhealthy: bool
     healthy_state_range: tuple[float, float]
     healthy_z_range: tuple[float, float]
     healthy_angle_range: tuple[float, float]
@@ -65,10 +61,7 @@ class Hopper(MujocoTask):
         damping=dict.fromkeys(_LEG, 1.0),
         motors=_LEG,
     )
-    native_effects = {
-        **{("viscous_friction", i): {"b": f"{joint}_damping"} for i, joint in enumerate(_LEG, 3)},
-        **{("torque_gain", i): {"gain": f"{joint}_gain"} for i, joint in enumerate(_LEG)},
-    }
+    native_effects = natives(joints, actuators, parameters)
 
     def healthy(self, state: State) -> Flag:
         rest = jnp.concatenate([state.q[2:], state.v])
@@ -76,20 +69,6 @@ class Hopper(MujocoTask):
         height = inside(state.q[1], *self.healthy_z_range)
         return fine & height & inside(state.q[2], *self.healthy_angle_range)
 
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        alive = self.healthy_reward * self.healthy(next_state)
-        return self._moving(state, action, next_state) + alive
-
-    def planning_reward(
-        self, state: State, action: Action, next_state: State, params: Params
-    ) -> Scalar:
-        height = margin(next_state.q[1], *self.healthy_z_range, _HEIGHT)
-        upright = margin(next_state.q[2], *self.healthy_angle_range, _ANGLE)
-        return self._moving(state, action, next_state) + self.healthy_reward * height * upright
-
-    def _moving(self, state: State, action: Action, next_state: State) -> Scalar:
-        speed = (next_state.q[0] - state.q[0]) / self.dt
-        return self.forward_reward_weight * speed - self.ctrl_cost_weight * jnp.sum(action**2)
-
-    def terminated(self, state: State, params: Params) -> Flag:
-        return ~self.healthy(state) & bool(self.terminate_when_unhealthy)
+    def health(self, state: State) -> Scalar:
+        height = margin(state.q[1], *self.healthy_z_range, _HEIGHT)
+        return height * margin(state.q[2], *self.healthy_angle_range, _ANGLE)

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core import Actuator, Channel, Joint, State
 from sb3_hds.core.types import Action, Obs, Params, Position, Scalar
-from sb3_hds.twins.locomotion.task import MujocoTask, seen
+from sb3_hds.twins.locomotion.task import MujocoTask, distance, seen
 from sb3_hds.twins.mujoco.engine.simulator import Reading
 from sb3_hds.twins.mujoco.engine.twin import Source
-from sb3_hds.twins.mujoco.engine.values import declared
+from sb3_hds.twins.mujoco.engine.values import declared, natives
 from sb3_hds.twins.mujoco.files.reading import read
 from sb3_hds.twins.mujoco.mechanism import Mechanism
 from sb3_hds.twins.mujoco.rigid_body import algebra as alg
@@ -34,7 +34,6 @@ _PLACES = ("tips_arm", "object", "goal")
 _SLOW = 0.005  # of start states [rad/s]
 _CLEAR = 0.17  # least distance between object and goal at the start [m]
 _N_DRAWS = 32  # of which 38 % are too near
-_LEAST = 1e-5  # [m], where the planning reward is flat
 
 
 def _places(data: Any) -> np.ndarray:
@@ -87,10 +86,7 @@ class Pusher(MujocoTask):
         gravity=None,
         friction=False,
     )
-    native_effects = {
-        **{("viscous_friction", i): {"b": f"{joint}_damping"} for i, joint in enumerate(_ARM)},
-        **{("torque_gain", i): {"gain": f"{joint}_gain"} for i, joint in enumerate(_ARM)},
-    }
+    native_effects = natives(joints, actuators, parameters)
 
     def _channels(self) -> tuple[Channel, ...]:
         return (
@@ -131,7 +127,7 @@ class Pusher(MujocoTask):
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
         tip, thing, goal = self._places(next_state).reshape(3, 3)
-        near, far = _distance(thing, tip), _distance(thing, goal)
+        near, far = distance(thing - tip), distance(thing - goal)
         effort = self.reward_control_weight * jnp.sum(action**2)
         return -self.reward_near_weight * near - self.reward_dist_weight * far - effort
 
@@ -148,9 +144,3 @@ class Pusher(MujocoTask):
             rotation, origin = frames[place.link]
             found += [zero + x for x in alg.vadd(origin, alg.apply(rotation, place.position))]
         return jnp.stack(found)
-
-
-def _distance(a: Float[Array, "3"], b: Float[Array, "3"]) -> Scalar:
-    """The distance, with a finite derivative where it is zero."""
-    squared = jnp.sum((a - b) ** 2)
-    return seen(jnp.sqrt(squared), jnp.sqrt(squared + _LEAST**2))

@@ -10,14 +10,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sb3_hds.core import Actuator, Channel, Joint, State
 from sb3_hds.core.types import Action, Obs, Params, Position, Scalar
-from sb3_hds.twins.locomotion.task import MujocoTask, seen
+from sb3_hds.twins.locomotion.task import MujocoTask, distance, seen
 from sb3_hds.twins.mujoco.engine.simulator import Reading
-from sb3_hds.twins.mujoco.engine.values import declared
+from sb3_hds.twins.mujoco.engine.values import declared, natives
 
 _ARM = ("joint0", "joint1")
 _UPPER, _FORE = 0.1, 0.11  # [m]
 _NEAR, _SLOW, _REACH = 0.1, 0.005, 0.2  # of start states [rad], [rad/s], [m]
-_LEAST = 1e-5  # [m], where the planning reward is flat
 _TIP, _TARGET = 3, 4  # bodies
 
 
@@ -62,10 +61,7 @@ class Reacher(MujocoTask):
         gravity=None,
         friction=False,
     )
-    native_effects = {
-        **{("viscous_friction", i): {"b": f"{joint}_damping"} for i, joint in enumerate(_ARM)},
-        **{("torque_gain", i): {"gain": f"{joint}_gain"} for i, joint in enumerate(_ARM)},
-    }
+    native_effects = natives(joints, actuators, parameters)
 
     def _channels(self) -> tuple[Channel, ...]:
         return (
@@ -106,11 +102,8 @@ class Reacher(MujocoTask):
         return jnp.concatenate([jnp.cos(arm), jnp.sin(arm), state.q[2:], state.v[:2], to_target])
 
     def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        squared = jnp.sum(self._to_target(next_state) ** 2)
-        smooth = jnp.sqrt(squared + _LEAST**2)
-        distance = seen(jnp.sqrt(squared), smooth)
         effort = self.reward_control_weight * jnp.sum(action**2)
-        return -self.reward_dist_weight * distance - effort
+        return -self.reward_dist_weight * distance(self._to_target(next_state)) - effort
 
     def _to_target(self, state: State) -> Float[Array, "2"]:
         return seen(self.reading(state, "to_target"), _kinematics(state.q))

@@ -1,16 +1,13 @@
 """Twin of Gymnasium's ``Swimmer-v5``."""
 
-import jax.numpy as jnp
-
-from sb3_hds.core import Actuator, Channel, Joint, State
-from sb3_hds.core.types import Action, Params, Scalar
-from sb3_hds.twins.locomotion.task import MujocoTask
-from sb3_hds.twins.mujoco.engine.values import declared
+from sb3_hds.core import Actuator, Channel, Joint
+from sb3_hds.twins.locomotion.task import ForwardTask
+from sb3_hds.twins.mujoco.engine.values import declared, natives
 
 _MOTORS = ("motor1_rot", "motor2_rot")
 
 
-class Swimmer(MujocoTask):
+class Swimmer(ForwardTask):
     r"""
     A chain of three links in a viscous medium, seen from above.
 
@@ -32,8 +29,6 @@ class Swimmer(MujocoTask):
         "reset_noise_scale": 0.1,
         "exclude_current_positions_from_observation": True,
     }
-    forward_reward_weight: float
-    ctrl_cost_weight: float
     joints = (
         Joint("slider1", "m"),
         Joint("slider2", "m"),
@@ -49,11 +44,4 @@ class Swimmer(MujocoTask):
         gravity=None,
         friction=False,
     )
-    native_effects = {
-        **{("viscous_friction", i): {"b": f"{m}_damping"} for i, m in enumerate(_MOTORS, 3)},
-        **{("torque_gain", i): {"gain": f"{motor}_gain"} for i, motor in enumerate(_MOTORS)},
-    }
-
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        speed = (next_state.q[0] - state.q[0]) / self.dt
-        return self.forward_reward_weight * speed - self.ctrl_cost_weight * jnp.sum(action**2)
+    native_effects = natives(joints, actuators, parameters)

@@ -1,5 +1,6 @@
 """What the twins of Gymnasium's MuJoCo tasks share."""
 
+import abc
 import dataclasses
 import functools
 import importlib.util
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sb3_hds.core import Channel, State
-from sb3_hds.core.types import Obs, Params, Position, Scalar
+from sb3_hds.core.types import Action, Flag, Obs, Params, Position, Scalar
 from sb3_hds.errors import EnvironmentMismatchError, ModelFileError
 from sb3_hds.twins.mujoco.engine.twin import EngineTwin, Source
 from sb3_hds.twins.mujoco.engine.values import Values
@@ -22,6 +23,8 @@ from sb3_hds.twins.mujoco.rigid_body.quaternions import normalized
 # Fields of a model that do not change its motion, or follow from others.
 _SEEN = ("cam_", "light_", "tex_", "mat_", "name", "skin_", "geom_rgba", "site_rgba", "key_", "D_")
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0")
+# [m], where the derivative of a distance ends.
+_LEAST = 1e-5
 _OPTIONS = ("integrator", "cone", "solver", "iterations", "density", "viscosity", "disableflags")
 
 
@@ -122,6 +125,53 @@ class MujocoTask(EngineTwin):
         return jnp.concatenate([q[:3], normalized(q[3:7]), q[7:]])
 
 
+class ForwardTask(MujocoTask):
+    """Abstract: speed along x is rewarded, and effort costs."""
+
+    forward_reward_weight: float
+    ctrl_cost_weight: float
+
+    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        speed = (next_state.q[0] - state.q[0]) / self.dt
+        return self.forward_reward_weight * speed - self.ctrl_cost_weight * jnp.sum(action**2)
+
+
+class HealthyTask(ForwardTask):
+    """
+    Abstract: so is every step after which the robot is healthy; otherwise, the episode ends.
+
+    Planning replaces the indicator by :meth:`health`.
+    """
+
+    healthy_reward: float
+    terminate_when_unhealthy: bool
+
+    @abc.abstractmethod
+    def healthy(self, state: State) -> Flag:
+        """:return: whether the robot stands"""
+
+    @abc.abstractmethod
+    def health(self, state: State) -> Scalar:
+        """:return: smoothly from 0 to 1 where the robot is healthy, 1/2 at its limits"""
+
+    def moving(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        """:return: the reward without that of being healthy"""
+        return ForwardTask.reward(self, state, action, next_state, params)
+
+    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
+        alive = self.healthy_reward * self.healthy(next_state)
+        return self.moving(state, action, next_state, params) + alive
+
+    def planning_reward(
+        self, state: State, action: Action, next_state: State, params: Params
+    ) -> Scalar:
+        alive = self.healthy_reward * self.health(next_state)
+        return self.moving(state, action, next_state, params) + alive
+
+    def terminated(self, state: State, params: Params) -> Flag:
+        return ~self.healthy(state) & bool(self.terminate_when_unhealthy)
+
+
 @dataclasses.dataclass(frozen=True)
 class Asset(Source):
     """
@@ -172,6 +222,12 @@ def seen(read: Float[Array, "..."], own: Float[Array, "..."]) -> Float[Array, ".
     :return: the value of the reading with the derivative of the other
     """
     return own + jax.lax.stop_gradient(read - own)
+
+
+def distance(way: Float[Array, " n"]) -> Scalar:
+    """:return: the length of a vector, with a finite derivative where it is zero"""
+    squared = jnp.sum(way**2)
+    return seen(jnp.sqrt(squared), jnp.sqrt(squared + _LEAST**2))
 
 
 def inside(x: Float[Array, "..."], low: float, high: float) -> Bool[Array, "..."]:

@@ -1,11 +1,9 @@
 """Twin of Gymnasium's ``Walker2d-v5``."""
 
-import jax.numpy as jnp
-
 from sb3_hds.core import Actuator, Channel, Joint, State
-from sb3_hds.core.types import Action, Flag, Params, Scalar
-from sb3_hds.twins.locomotion.task import MujocoTask, inside, margin
-from sb3_hds.twins.mujoco.engine.values import declared
+from sb3_hds.core.types import Flag, Scalar
+from sb3_hds.twins.locomotion.task import HealthyTask, inside, margin
+from sb3_hds.twins.mujoco.engine.values import declared, natives
 
 _RIGHT = ("thigh_joint", "leg_joint", "foot_joint")
 _LEGS = (*_RIGHT, "thigh_left_joint", "leg_left_joint", "foot_left_joint")
@@ -13,7 +11,7 @@ _LEGS = (*_RIGHT, "thigh_left_joint", "leg_left_joint", "foot_left_joint")
 _HEIGHT, _ANGLE = 0.05, 0.1  # [m], [rad]
 
 
-class Walker2d(MujocoTask):
+class Walker2d(HealthyTask):
     r"""
     Two legs of three links under a torso, in the plane. It ends when the torso is too low, too high
     or tilts.
@@ -45,10 +43,6 @@ class Walker2d(MujocoTask):
         "reset_noise_scale": 5e-3,
         "exclude_current_positions_from_observation": True,
     }
-    forward_reward_weight: float
-    ctrl_cost_weight: float
-    healthy_reward: float
-    terminate_when_unhealthy: bool
     healthy_z_range: tuple[float, float]
     healthy_angle_range: tuple[float, float]
     joints = (Joint("rootx", "m"), Joint("rootz", "m"), Joint("rooty"), *map(Joint, _LEGS))
@@ -67,29 +61,12 @@ class Walker2d(MujocoTask):
         damping=dict.fromkeys(_LEGS, 0.1),
         motors=_LEGS,
     )
-    native_effects = {
-        **{("viscous_friction", i): {"b": f"{joint}_damping"} for i, joint in enumerate(_LEGS, 3)},
-        **{("torque_gain", i): {"gain": f"{joint}_gain"} for i, joint in enumerate(_LEGS)},
-    }
+    native_effects = natives(joints, actuators, parameters)
 
     def healthy(self, state: State) -> Flag:
         height = inside(state.q[1], *self.healthy_z_range)
         return height & inside(state.q[2], *self.healthy_angle_range)
 
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        alive = self.healthy_reward * self.healthy(next_state)
-        return self._moving(state, action, next_state) + alive
-
-    def planning_reward(
-        self, state: State, action: Action, next_state: State, params: Params
-    ) -> Scalar:
-        height = margin(next_state.q[1], *self.healthy_z_range, _HEIGHT)
-        upright = margin(next_state.q[2], *self.healthy_angle_range, _ANGLE)
-        return self._moving(state, action, next_state) + self.healthy_reward * height * upright
-
-    def _moving(self, state: State, action: Action, next_state: State) -> Scalar:
-        speed = (next_state.q[0] - state.q[0]) / self.dt
-        return self.forward_reward_weight * speed - self.ctrl_cost_weight * jnp.sum(action**2)
-
-    def terminated(self, state: State, params: Params) -> Flag:
-        return ~self.healthy(state) & bool(self.terminate_when_unhealthy)
+    def health(self, state: State) -> Scalar:
+        height = margin(state.q[1], *self.healthy_z_range, _HEIGHT)
+        return height * margin(state.q[2], *self.healthy_angle_range, _ANGLE)

@@ -15,7 +15,7 @@ from sb3_hds.core import Actuator, Channel, Joint, State
 from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar
 from sb3_hds.errors import ModelFileError, ParameterError
 from sb3_hds.twins.mujoco.engine.twin import EngineTwin, Source
-from sb3_hds.twins.mujoco.engine.values import actuator_name, declared
+from sb3_hds.twins.mujoco.engine.values import actuator_name, declared, natives
 from sb3_hds.twins.mujoco.library import mujoco
 from sb3_hds.twins.mujoco.rigid_body.quaternions import normalized
 
@@ -61,7 +61,7 @@ class ContactTwin(EngineTwin):
             raise ParameterError(f"observe must be 'q' or 'qv', got {observe!r}.")
         self._source = Compiled.from_spec(model) if isinstance(model, str) else Compiled.of(model)
         self.observed, self._reward, self._terminated = observe, reward, terminated
-        read = self._source.load()
+        read = self.model
         _check(read)
         mj = mujoco()
         joints = [_name(read, mj.mjtObj.mjOBJ_JOINT, j, "joint") for j in range(read.njnt)]
@@ -101,11 +101,8 @@ class ContactTwin(EngineTwin):
             gravity=float(-read.opt.gravity[2]),
             sliding=[joint.name for joint in dofs if joint.unit == "m"],
         )
-        self.native_effects = {
-            ("viscous_friction", i): {"b": f"{joint.name}_damping"}
-            for i, joint in enumerate(dofs)
-            if f"{joint.name}_damping" in self.parameters
-        }
+        # The gain of a servo is no gain of its force.
+        self.native_effects = natives(dofs, (), self.parameters)
         step = float(read.opt.timestep)
         dt = step if dt is None else dt
         if substeps is None:

@@ -272,10 +272,10 @@ def _typical_forces(source: Source) -> tuple[float, ...]:
     low, high = model.actuator_ctrlrange.T
     limited = model.actuator_ctrllimited.astype(bool)
     largest = np.zeros(model.nv)
+    mj.mj_forward(model, data)
+    idle = data.qfrc_actuator.copy()
     for i in np.flatnonzero(limited):
         data.ctrl[:] = 0.0
-        mj.mj_forward(model, data)
-        idle = data.qfrc_actuator.copy()
         data.ctrl[i] = max(abs(low[i]), abs(high[i]))
         mj.mj_forward(model, data)
         largest += np.abs(data.qfrc_actuator - idle)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_hds.core import Parameter
+from sb3_hds.core import Actuator, Joint, Parameter
 from sb3_hds.errors import ModelFileError
 from sb3_hds.twins.mujoco.library import mujoco
 
@@ -52,6 +52,18 @@ def declared(
     if friction:
         found[FRICTION] = Parameter(1.0, 0.2, "1", 0.0)
     return found
+
+
+def natives(
+    joints: Iterable[Joint], actuators: Iterable[Actuator], parameters: Mapping[str, Parameter]
+) -> dict[tuple[str, int], dict[str, str]]:
+    """:return: which effects are parameters of the model already, for ``Twin.native_effects``"""
+    dampings = ((i, f"{joint.name}_damping") for i, joint in enumerate(joints))
+    gains = ((i, f"{actuator.name}_gain") for i, actuator in enumerate(actuators))
+    return {
+        **{("viscous_friction", i): {"b": name} for i, name in dampings if name in parameters},
+        **{("torque_gain", i): {"gain": name} for i, name in gains if name in parameters},
+    }
 
 
 class Values:
