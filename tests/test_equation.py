@@ -12,6 +12,7 @@ from sb3_hds import Trajectories, diagnose, effects, twins
 from sb3_hds.core import rollout
 from sb3_hds.sysid.checks.conventions import other_convention
 from sb3_hds.sysid.checks.timing import match_logged_integrator
+from sb3_hds.sysid.equation import members
 from sb3_hds.sysid.equation.assembly import assemble
 from sb3_hds.sysid.equation.effect_columns import impulse_weights
 from sb3_hds.sysid.equation.screening import screen
@@ -154,6 +155,19 @@ def test_intervals_allow_for_a_cause_that_may_be_there_too():
     assert found.doubts_of(alone) == {"coulomb_friction.axis.tau_c": alone.doubt["tau_c"]}
 
 
+def test_causes_that_are_too_small_to_be_named_make_intervals_wider(monkeypatch):
+    """Akaike's criterion gives them more weight than Schwarz's, by which the set is chosen."""
+    found = screened(pull=lambda q, v: -3.0 * v - 0.15 * v * abs(v))
+    keys = [m.key for m in found.members]
+    monkeypatch.setattr(members, "_AKAIKE", found.problem.cost)
+
+    [wide], [narrow] = (
+        [m.doubt["b"] for m in each.members if m.key == "viscous_friction.axis"]
+        for each in (found, found.among(keys))
+    )
+    assert wide > 1.5 * narrow
+
+
 def test_members_of_a_set_have_other_sizes_where_one_of_them_is_left_out():
     both = screened()
     [alone] = both.among({"viscous_friction.axis"}).members
@@ -209,6 +223,17 @@ def test_commands_are_late_from_three_hundredths_of_an_interval(delay, named):
 
     late = {"action_delay.force": {"delay": pytest.approx(delay, rel=0.02)}}
     assert found == (late if named else {})
+
+
+def test_a_lag_close_to_a_node_is_within_both_pieces_of_its_chain():
+    twin = twins.make("LinearAxis", mass=2.0, damping=3.0, dt=0.01)
+    real = twin.extend(effects.MotorLag(time_constant=0.0401).at(0))
+    data = measured(real, n=4, noise=1e-4, commands=waves(0.01))
+    p = screen(twin, smoothed_motion(twin, data), effects.ALL, ()).problem
+
+    pieces = [i for i, item in enumerate(p.items) if item.candidate.name == "motor_lag"]
+    within = [p.items[i].settings for i in pieces if not p.out_of_bounds([i])]
+    assert [s["time_constant"] for two in within for s in two] == [0.025, 0.04, 0.04, 0.06]
 
 
 @pytest.mark.parametrize("lag", [0.02, 0.04, 0.045])
