@@ -87,6 +87,9 @@ class ExtendedTwin(Layer):
         base = self._base_with_values().at_interval(dt, substeps)
         return ExtendedTwin(base, *self.effects_with_values())
 
+    def freed(self, names: Collection[str] | None = None) -> "ExtendedTwin":
+        return ExtendedTwin(self._base_with_values().freed(names), *self.effects_with_values())
+
     def initial(self, key: PRNGKeyArray, params: Params) -> State:
         return self._with_memory(self.base.initial(key, self.base_params(params)), params)
 

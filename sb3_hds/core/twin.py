@@ -161,6 +161,13 @@ class Twin(abc.ABC):
         changed.dt, changed.substeps = float(dt), int(substeps)
         return changed
 
+    def freed(self, names: Collection[str] | None = None) -> "Twin":
+        """
+        :param names: of parameters that are constants of this twin; default: all that may be freed
+        :return: the same system, with these constants as parameters, such as the masses of bodies
+        """
+        return self
+
     def extend(self, *effects: Effect) -> "Twin":
         """:return: this twin with ``effects`` attached, in the order of the signal path"""
         from sb3_hds.core.extended import ExtendedTwin

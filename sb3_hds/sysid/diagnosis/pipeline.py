@@ -81,10 +81,11 @@ class Inquiry:
         budget: str,
         progress: bool | Bar,
     ) -> None:
-        self.nominal, self.seed = twin, seed
+        self.seed = seed
         self.bar = progress if isinstance(progress, Bar) else Bar(progress)
         self.data_hash = hash_of(data)
         self.given = prepare(twin, data, effects, calibrate, seed, self.bar)
+        self.nominal = self.given.nominal
         self.hypotheses, self.screened = self.given.hypotheses, self.given.screened
         self.effort = EFFORTS[budget]
 

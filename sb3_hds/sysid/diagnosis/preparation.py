@@ -101,6 +101,7 @@ class Prepared:
     """
     Recordings and candidates, ready to be compared.
 
+    :param nominal: model, with the parameters that are simulated
     :param audit: of the recordings
     :param corrected: what was corrected in them, a sentence each
     :param sensor_noise: standard deviation of each channel's noise, shape ``(n_obs,)``
@@ -118,6 +119,7 @@ class Prepared:
     :param least_substeps: of simulations, before dry friction was found
     """
 
+    nominal: Twin
     audit: Audit
     corrected: tuple[str, ...]
     sensor_noise: Float[np.ndarray, " obs"]
@@ -196,6 +198,7 @@ def prepare(
     :param bar: shows how far it is
     """
     bar.stage("reading the log")
+    nominal = twin = twin.freed(tuple(calibrate))
     data, audited, corrected = _without_glitches(twin, data)
     data, shortened = shortened_to(twin, data)
     data, in_time = align_velocities(twin, data)
@@ -210,8 +213,11 @@ def prepare(
         convention = other_convention(twin, moved, tuple(calibrate))
     if not audited.reason and convention is None:
         bar.stage("equation of motion")
-        screened = screen(twin, moved, effects, calibrate)
-        coarse = fine_enough(coarse, screened) if screened else coarse
+        screened = screen(twin.freed(), moved, effects, calibrate)
+        if screened:
+            named = [c.place for c in screened.hypotheses.candidates if c.key in screened.keys]
+            nominal = nominal.freed(named)
+            coarse = fine_enough(coarse.freed(named), screened)
     only = screened and screened.keys
     where = screened and screened.nameless_at
     hypotheses = Hypotheses.about(
@@ -225,6 +231,7 @@ def prepare(
         some = evenly(len(origin), 2 * most_windows)
         shots, origin = shots.rows(some), origin[some]
     return Prepared(
+        nominal=nominal,
         audit=audited,
         corrected=(*corrected, *shortened, *in_time, *as_logged),
         sensor_noise=sensor_noise,

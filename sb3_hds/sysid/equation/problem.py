@@ -97,10 +97,14 @@ class Problem:
 
     def family(self, i: int) -> tuple:
         """A set contains at most one item of each family."""
-        candidate = self.items[i].candidate
-        if candidate.slot == PARAMETER:
-            return (candidate.key,)
-        return plausibility(candidate.name).family, *self.place(i)
+        return self._families[i]
+
+    @cached_property
+    def _families(self) -> tuple[tuple, ...]:
+        return tuple(
+            (c.key,) if c.slot == PARAMETER else (plausibility(c.name).family, c.slot, c.index)
+            for c in (item.candidate for item in self.items)
+        )
 
     def clashes(self, keys: Sequence[int]) -> bool:
         """Whether two items exclude each other."""
@@ -231,8 +235,10 @@ class Problem:
         return np.diag(inverse) * (self.diagonal[own] + self.prior[own])
 
     def admissible(self, keys: Sequence[int], found: Solution) -> bool:
-        """Whether all members are inside their bounds, and not collinear."""
+        """Whether all members are inside their bounds, not collinear, and leave some command."""
         if not np.isfinite(found.rss):
+            return False
+        if min(self._passed(keys).values(), default=1.0) <= 0.0:
             return False
         if found.free and self._inflation(found.free, found.inverse).max() > _MOST_INFLATION:
             return False
@@ -300,11 +306,11 @@ class Problem:
         0 = 0. So residuals count relative to the remaining command and inertia.
         """
         out, value = np.zeros(self.dof), found.value
+        for place, passed in self._passed(keys).items():
+            out[list(place)] += 2.0 * np.log(max(passed, _LEAST_LEFT))
         for i in keys:
             item = self.items[i]
-            if i in self.passes:
-                out[self.joints(i)] += 2.0 * np.log(max(self.passes[i], _LEAST_LEFT))
-            elif item.candidate.name in GAINS:
+            if item.candidate.name in GAINS:
                 changes = [value[c] for c in item.free if c in value]
                 left = max(1.0 + min(changes), _LEAST_LEFT)
                 out[self.joints(i)] += 2.0 * min(0.0, np.log(left))
@@ -312,6 +318,17 @@ class Problem:
                 change = value.get(item.columns[0], 0.0) * self.drives[item.key]
                 out += 2.0 * np.minimum(0.0, np.log(np.maximum(1.0 + change, _LEAST_LEFT)))
         return out + np.minimum(0.0, self._change_of_noise(keys, value))
+
+    def _passed(self, keys: Sequence[int]) -> dict[tuple[int, ...], float]:
+        """
+        :return: by joints, the share of commands that a dead zone, which lets the large ones pass,
+            and a saturation, which lets the small ones pass, leave together
+        """
+        found: dict[tuple[int, ...], float] = {}
+        for i in (i for i in keys if i in self.passes):
+            place = tuple(map(int, self.joints(i)))
+            found[place] = found.get(place, 1.0) + self.passes[i] - 1.0
+        return found
 
     def _change_of_noise(self, keys: Sequence[int], value: dict[int, float]) -> np.ndarray:
         """

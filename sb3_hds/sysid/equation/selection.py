@@ -51,9 +51,16 @@ def propose(problem: Problem) -> tuple[list[int], list[int]]:
     keys = _retry_without_doubtful(problem, keys)
     keys = _drop_negligible(problem, keys)
     keys = _simplify(problem, keys)
-    keys = _prefer_plausible(problem, keys)
-    keys = _simplify(problem, _drop_unconfirmed(problem, keys))
-    return _split_hints(problem, keys)
+    less_plausible: set[int] = set()
+    while True:
+        preferred = _prefer_plausible(problem, keys)
+        replaced = {*keys} - {*preferred}
+        less_plausible |= replaced
+        if replaced:
+            _, preferred = _climb(problem, preferred, less_plausible)
+        keys = _simplify(problem, _drop_unconfirmed(problem, preferred))
+        if not replaced:
+            return _split_hints(problem, keys)
 
 
 # ------------------------------------------------------------------------------ starts
@@ -128,9 +135,10 @@ def _one_for_two(p: Problem, keys: list[int]) -> list[list[int]]:
     """
     trials = []
     own = [i for i in keys if i not in p.always and p.items[i].candidate.slot == PARAMETER]
+    others = {i: substitutes(p, keys, i) for i in own}
     for one, other in itertools.combinations(own, 2):
         rest = [m for m in keys if m not in (one, other)]
-        common = [o for o in substitutes(p, keys, one) if o in set(substitutes(p, keys, other))]
+        common = sorted({*others[one]} & {*others[other]})
         trials += [retune(p, [*rest, o]) for o in p.ranking(rest, common)[:_SWAPPED]]
     return trials
 

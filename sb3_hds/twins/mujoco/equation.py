@@ -1,5 +1,6 @@
 """The equation of motion of a mechanism, and its derivative."""
 
+from collections.abc import Collection
 from functools import cache
 from itertools import zip_longest
 from typing import Any
@@ -50,10 +51,12 @@ class Equation:
     Robotics: Science and Systems 2018.
 
     :param payload: place of an unknown mass
-    :param masses: whether mass, centre and inertia of each body are parameters
+    :param masses: names of bodies whose mass, centre and inertia are parameters
     """
 
-    def __init__(self, mechanism: Mechanism, payload: Place | None, masses: bool) -> None:
+    def __init__(
+        self, mechanism: Mechanism, payload: Place | None, masses: Collection[str]
+    ) -> None:
         self.mechanism, self.payload, self.masses = mechanism, payload, masses
         self.typical = typical(mechanism)
         self.parameters = of_plant(mechanism, self.typical, payload, masses)

@@ -28,7 +28,7 @@ def from_mujoco(
     integrator: str | None = None,
     observe: str = "qv",
     payload: str | None = None,
-    masses: bool = False,
+    masses: bool | Collection[str] = False,
     reward: Reward | None = None,
     terminated: Terminated | None = None,
     ignore: Collection[str] = (),
@@ -53,8 +53,9 @@ def from_mujoco(
         ``"implicitfast"`` for a URDF
     :param observe: ``"qv"`` for positions and velocities, ``"q"`` for positions only
     :param payload: name of a site or body at which, or near which, an unknown mass may be
-    :param masses: whether mass, centre and inertia of each body are parameters, too; a warning
-        lists those that no motion can identify
+    :param masses: names of bodies whose mass, centre and inertia are parameters, too, or True for
+        all; a warning lists those that no motion can identify. A diagnosis tries masses and centres
+        of all bodies anyway.
     :param reward: of a task: ``reward(state, action, next_state, params)``
     :param terminated: termination of a task: ``terminated(state, params)``
     :param ignore: features of the model that the twin omits: ``"contacts"`` if there are none in

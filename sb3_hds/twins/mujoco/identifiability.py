@@ -10,7 +10,7 @@ from sb3_hds.twins.mujoco.parameters import (
     bodies_of,
     compensated,
     gravity_of,
-    of_body,
+    of_inertia,
     random_positions,
 )
 from sb3_hds.twins.mujoco.rigid_body.dynamics import Tree, configuration, inverse_dynamics
@@ -63,8 +63,8 @@ def unidentifiable(twin: "MechanismTwin") -> str:
 def inertial(twin: "MechanismTwin") -> list[str]:
     """:return: names of the parameters of masses and inertias"""
     mechanism = twin.mechanism
-    bodies = [link.body for link in mechanism.links if link.body]
-    found = [name for body in bodies for name in of_body(body)]
+    bodies = [link.body.name for link in mechanism.links if link.body]
+    found = [name for body in bodies for name in of_inertia(body)]
     found += [f"{link.joint}_armature" for link in mechanism.links]
     return [name for name in found if name in twin.parameters]
 
@@ -85,7 +85,7 @@ def regressor(twin: "MechanismTwin", names: list[str]) -> Float[np.ndarray, "row
             continue
         p = values | {name: np.asarray(values[name] + 1j * _STEP * twin.parameters[name].scale)}
         at = configuration(
-            tree, q, bodies_of(mechanism, twin.payload, True, p), compensated(mechanism)
+            tree, q, bodies_of(mechanism, twin.payload, twin.masses, p), compensated(mechanism)
         )
         force = inverse_dynamics(tree, at, v, gravity_of(mechanism, values), a)
         columns.append(np.imag(force).ravel() / _STEP)

@@ -6,7 +6,7 @@ Names are those of joints and actuators with MJCF's words: ``elbow_damping``,
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -35,7 +35,7 @@ from sb3_hds.twins.mujoco.rigid_body.dynamics import (
 
 Values = Mapping[str, Number]
 
-_AXES = "xyz"
+_AXES, _PLANES = "xyz", ("xy", "xz", "yz")
 # Typical deviations, as shares of a joint's typical force and inertia, and of a parameter's value.
 _OF_FORCE, _OF_FORCE_PER_SPEED, _OF_INERTIA, _OF_ITSELF = 0.05, 0.02, 0.1, 0.1
 # Typical force of a drive, as a share of its largest force.
@@ -48,11 +48,11 @@ _N_POSES = 64
 
 
 def of_plant(
-    mechanism: Mechanism, usual: "Typical", payload: Place | None, masses: bool
+    mechanism: Mechanism, usual: "Typical", payload: Place | None, masses: Collection[str]
 ) -> dict[str, Parameter]:
     """
     :param payload: place of an unknown mass
-    :param masses: whether mass, centre and inertia of each body are parameters
+    :param masses: names of bodies whose mass, centre and inertia are parameters
     :return: the parameters of the equation of motion
     """
     forces = usual.weight + _OF_DRIVE * usual.drive
@@ -65,9 +65,9 @@ def of_plant(
         found[f"{payload.name}_payload"] = Parameter(0.0, scale, "kg", 0.0)
         for axis in _AXES:
             found[f"{payload.name}_payload_{axis}"] = Parameter(0.0, _NEAR, "m")
-    if masses:
-        for body in moving:
-            found |= of_body(body)
+    for i, link in enumerate(mechanism.links):
+        if link.body is not None and link.body.name in masses:
+            found |= _of_body(link.body, _reach(mechanism, i))
     return found
 
 
@@ -140,15 +140,62 @@ def _of_drive(drive: Drive, link: Link) -> dict[str, Parameter]:
     }
 
 
-def of_body(body: Body) -> dict[str, Parameter]:
+def named_bodies(mechanism: Mechanism, masses: bool | Collection[str]) -> tuple[str, ...]:
+    """
+    :param masses: names of bodies, True for all, or False for none
+    :return: their names, in the order of the model
+    :raises ParameterError: for the name of a body that does not move, or that there is not
+    """
+    every = tuple(link.body.name for link in mechanism.links if link.body)
+    if isinstance(masses, bool):
+        return every if masses else ()
+    wanted = (masses,) if isinstance(masses, str) else tuple(masses)
+    for name in wanted:
+        if name not in every:
+            raise ParameterError(
+                f"masses names '{name}', which {mechanism.name} does not have or move."
+                f"{did_you_mean(name, every)}"
+            )
+    return tuple(name for name in every if name in wanted)
+
+
+def of_mass(body: str) -> tuple[str, ...]:
+    """:return: names of the mass and the centre of mass of a body"""
+    return f"{body}_mass", *(f"{body}_com_{axis}" for axis in _AXES)
+
+
+def shape_of(body: str) -> tuple[str, ...]:
+    """:return: names of the parameters of its inertia per unit of mass"""
+    stretches = tuple(f"{body}_stretch_{axis}" for axis in _AXES)
+    return *stretches, *(f"{body}_shear_{plane}" for plane in _PLANES)
+
+
+def of_inertia(body: str) -> tuple[str, ...]:
+    """:return: names of the mass, the centre of mass and the shape of a body"""
+    return *of_mass(body), *shape_of(body)
+
+
+def _reach(mechanism: Mechanism, i: int) -> float:
+    """
+    :return: how far the centre of mass of a link may be from where the model has it [m]: as far as
+        the joints at its ends are, or twice its radius of gyration
+    """
+    body = mechanism.links[i].body
+    assert body is not None
+    ends = [np.zeros(3), *(np.array(x.origin) for x in mechanism.links if x.parent == i)]
+    gyration = math.sqrt(max(sum(body.inertia[:3]), 0.0) / 2.0 / body.mass)
+    return max(2.0 * gyration, *(float(np.linalg.norm(end - body.centre)) for end in ends))
+
+
+def _of_body(body: Body, reach: float) -> dict[str, Parameter]:
     """:return: mass, centre and inertia; any values are physically consistent"""
-    found = {f"{body.name}_mass": Parameter(body.mass, 0.1 * body.mass, "kg", 1e-3 * body.mass)}
-    for axis, value in zip(_AXES, centre_in_body(body), strict=True):
-        found[f"{body.name}_com_{axis}"] = Parameter(value, _SHIFT, "m")
-    for axis in _AXES:
-        found[f"{body.name}_stretch_{axis}"] = Parameter(0.0, _STRETCH, "1", -3.0, 3.0)
-    for plane in ("xy", "xz", "yz"):
-        found[f"{body.name}_shear_{plane}"] = Parameter(0.0, _STRETCH, "1", -10.0, 10.0)
+    mass, *centre = of_mass(body.name)
+    found = {mass: Parameter(body.mass, 0.1 * body.mass, "kg", 1e-3 * body.mass)}
+    for name, value in zip(centre, centre_in_body(body), strict=True):
+        found[name] = Parameter(value, _SHIFT, "m", value - reach, value + reach)
+    for k, name in enumerate(shape_of(body.name)):
+        most = 3.0 if k < len(_AXES) else 10.0
+        found[name] = Parameter(0.0, _STRETCH, "1", -most, most)
     return found
 
 
@@ -180,14 +227,14 @@ def gravity_of(mechanism: Mechanism, p: Values) -> Vector:
 
 
 def bodies_of(
-    mechanism: Mechanism, payload: Place | None, masses: bool, p: Values
+    mechanism: Mechanism, payload: Place | None, masses: Collection[str], p: Values
 ) -> list[spatial.Body]:
     """:return: the body of each link that has one, payload included"""
     found = []
     for i, link in enumerate(mechanism.links):
         if link.body is None:
             continue
-        own = _with_values(link.body, p) if masses else _nominal(link.body)
+        own = (_with_values if link.body.name in masses else _nominal)(link.body, p)
         if payload is not None and payload.link == i:
             offset = [p[f"{payload.name}_payload_{axis}"] for axis in _AXES]
             place = alg.vadd(payload.position, alg.apply(payload.rotation, offset))
@@ -207,7 +254,7 @@ def compensated(mechanism: Mechanism) -> list[spatial.Body | None]:
     return found
 
 
-def _nominal(body: Body) -> spatial.Body:
+def _nominal(body: Body, p: Values) -> spatial.Body:
     return spatial.Body(body.mass, body.centre, _second_moments(body.inertia))
 
 
@@ -232,7 +279,7 @@ def _with_values(body: Body, p: Values) -> spatial.Body:
     mass = p[f"{name}_mass"]
     centre = [p[f"{name}_com_{axis}"] for axis in _AXES]
     x, y, z = (alg.exp(p[f"{name}_stretch_{axis}"]) for axis in _AXES)
-    xy, xz, yz = (p[f"{name}_shear_{plane}"] for plane in ("xy", "xz", "yz"))
+    xy, xz, yz = (p[f"{name}_shear_{plane}"] for plane in _PLANES)
     stretch = ((x, xy, xz), (0.0, y, yz), (0.0, 0.0, z))
     axes = np.array(turn)
     nominal = axes.T @ np.array(alg.full(_second_moments(body.inertia))) @ axes / body.mass
@@ -276,7 +323,7 @@ class Typical(NamedTuple):
 def typical(mechanism: Mechanism) -> Typical:
     """:return: typical inertias and forces"""
     tree, q = Tree(mechanism.links), random_positions(mechanism, _N_POSES)
-    at = configuration(tree, q, bodies_of(mechanism, None, False, {}), compensated(mechanism))
+    at = configuration(tree, q, bodies_of(mechanism, None, (), {}), compensated(mechanism))
     weight = np.abs(inverse_dynamics(tree, at, np.zeros((_N_POSES, tree.n)), mechanism.gravity))
     armature = np.concatenate([link.armature for link in mechanism.links])
     matrix = np.broadcast_to(mass_matrix(tree, at), (_N_POSES, tree.n, tree.n))

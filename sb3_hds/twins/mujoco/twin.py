@@ -1,9 +1,10 @@
 """A twin made from a model file."""
 
+import copy
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import jax
@@ -30,7 +31,15 @@ from sb3_hds.errors import ParameterError
 from sb3_hds.twins.mujoco.actuators import Actuation, Moving
 from sb3_hds.twins.mujoco.equation import Equation
 from sb3_hds.twins.mujoco.mechanism import FREE, SLIDE, Mechanism
-from sb3_hds.twins.mujoco.parameters import dof_names, native_effects, of_drives, place_of
+from sb3_hds.twins.mujoco.parameters import (
+    dof_names,
+    named_bodies,
+    native_effects,
+    of_drives,
+    of_mass,
+    place_of,
+    shape_of,
+)
 from sb3_hds.twins.mujoco.rigid_body import algebra as alg
 from sb3_hds.twins.mujoco.rigid_body.dynamics import frames_of
 from sb3_hds.twins.mujoco.rigid_body.quaternions import normalized, turn_between, turned
@@ -64,7 +73,7 @@ class MechanismTwin(AnalyticTwin):
     :param observe: ``"qv"`` for positions and velocities, ``"q"`` for positions only: then
         :meth:`infer` sets velocities to zero
     :param payload: name of the site or body that may carry an unknown mass
-    :param masses: whether mass, centre and inertia of each body are parameters
+    :param masses: bodies whose mass, centre and inertia are parameters; True: all
     :param dt: control interval [s]; default: the model's time step
     :param substeps: default: the fewest with at most the model's time step
     :param reward: of a task; None: zero
@@ -80,7 +89,7 @@ class MechanismTwin(AnalyticTwin):
         *,
         observe: str = "qv",
         payload: str | None = None,
-        masses: bool = False,
+        masses: bool | Collection[str] = False,
         dt: float | None = None,
         substeps: int | None = None,
         reward: Reward | None = None,
@@ -96,17 +105,10 @@ class MechanismTwin(AnalyticTwin):
         if observe not in ("q", "qv"):
             raise ParameterError(f"{mechanism.name} can observe 'q' or 'qv', got {observe!r}.")
         self.mechanism, self.name, self.observed = mechanism, mechanism.name, observe
-        self.masses = bool(masses)
         self.payload = None if payload is None else place_of(mechanism, payload)
-        self.equation = Equation(mechanism, self.payload, self.masses)
+        self._declare(named_bodies(mechanism, masses))
         self.actuation = Actuation(mechanism)
-        self.parameters = self.equation.parameters | of_drives(mechanism)
         self.native_effects = native_effects(mechanism)
-        # The damping gain of a drive counts as known, because viscous friction is aliased with it.
-        servos = ("position", "velocity")
-        self.known_parameters = frozenset(
-            f"{drive.name}_kv" for drive in mechanism.drives if drive.role in servos
-        )
         limits = [link.limit or _UNLIMITED for link in mechanism.links for _ in link.dofs]
         self.joints = tuple(
             Joint(*joint, *limit) for joint, limit in zip(dof_names(mechanism), limits, strict=True)
@@ -121,6 +123,29 @@ class MechanismTwin(AnalyticTwin):
         if substeps is None and dt > 0.0:
             substeps = max(1, math.ceil(dt / mechanism.timestep - 1e-6))
         super().__init__(dt=dt, substeps=substeps, **settings)
+
+    def _declare(self, masses: tuple[str, ...]) -> None:
+        self.masses = masses
+        self.equation = Equation(self.mechanism, self.payload, masses)
+        self.parameters = self.equation.parameters | of_drives(self.mechanism)
+        # The damping gain of a drive counts as known, because viscous friction is aliased with it;
+        # so does the shape of a body, which hardly any motion identifies.
+        servos = ("position", "velocity")
+        damping = {f"{d.name}_kv" for d in self.mechanism.drives if d.role in servos}
+        shapes = {name for body in masses for name in shape_of(body)}
+        self.known_parameters = frozenset(damping | shapes)
+
+    def freed(self, names: Collection[str] | None = None) -> "MechanismTwin":
+        every = named_bodies(self.mechanism, True)
+        wanted = [b for b in every if names is None or not {*of_mass(b)}.isdisjoint(names)]
+        masses = tuple(body for body in every if body in {*self.masses, *wanted})
+        if masses == self.masses:
+            return self
+        changed = copy.copy(self)
+        changed._declare(masses)
+        nominal = {name: parameter.null for name, parameter in changed.parameters.items()}
+        changed.values = nominal | self.values
+        return changed
 
     # --- dynamics
 

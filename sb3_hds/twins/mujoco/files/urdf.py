@@ -16,7 +16,7 @@ from sb3_hds.twins.mujoco.files.correction import (
     in_body_frame,
 )
 from sb3_hds.twins.mujoco.mechanism import Body, Link
-from sb3_hds.twins.mujoco.parameters import of_body
+from sb3_hds.twins.mujoco.parameters import of_inertia
 from sb3_hds.twins.mujoco.rigid_body import spatial
 
 
@@ -47,7 +47,7 @@ def urdf_of(correction: Correction, source: Any) -> str:
     recorded = {name for name in correction.values if "_payload" in name}
     for link in correction.mechanism.links:
         recorded |= {f"{link.joint}_{name}" for name in OF_JOINTS[:2]}
-        recorded |= set(of_body(link.body) if link.body else ())
+        recorded |= set(of_inertia(link.body.name) if link.body else ())
     for name in correction.values:
         if correction.difference(name) and name not in recorded:
             correction.record_left_out(name)
