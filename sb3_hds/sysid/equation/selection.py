@@ -21,6 +21,8 @@ from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Moves that are tried from each set: best additions, best substitutes of a member, and rounds.
 _ADDED, _SWAPPED, _MOST_MOVES = 12, 5, 80
+# Of sets with one cause in place of two, so many are tried with new nonlinear parameters.
+_RETUNED = 3
 # Rarity from which members are retried without, and how many.
 _DOUBTFUL, _MOST_SHAKEN = 1.5, 4
 _VISCOUS, _DRY = "viscous_friction", "coulomb_friction"
@@ -49,18 +51,17 @@ def propose(problem: Problem) -> tuple[list[int], list[int]]:
     _, keys = min((_climb(problem, start) for start in _starts(problem)), key=lambda r: r[0])
     keys = _try_shared(problem, keys)
     keys = _retry_without_doubtful(problem, keys)
-    keys = _drop_negligible(problem, keys)
-    keys = _simplify(problem, keys)
     less_plausible: set[int] = set()
     while True:
+        keys = _simplify(problem, _drop_negligible(problem, keys))
         preferred = _prefer_plausible(problem, keys)
-        replaced = {*keys} - {*preferred}
-        less_plausible |= replaced
-        if replaced:
-            _, preferred = _climb(problem, preferred, less_plausible)
-        keys = _simplify(problem, _drop_unconfirmed(problem, preferred))
+        replaced = {*keys} - {*preferred} - less_plausible
         if not replaced:
-            return _split_hints(problem, keys)
+            break
+        less_plausible |= replaced
+        _, keys = _climb(problem, preferred, less_plausible)
+    keys = _simplify(problem, _drop_unconfirmed(problem, preferred))
+    return _split_hints(problem, keys)
 
 
 # ------------------------------------------------------------------------------ starts
@@ -139,8 +140,8 @@ def _one_for_two(p: Problem, keys: list[int]) -> list[list[int]]:
     for one, other in itertools.combinations(own, 2):
         rest = [m for m in keys if m not in (one, other)]
         common = sorted({*others[one]} & {*others[other]})
-        trials += [retune(p, [*rest, o]) for o in p.ranking(rest, common)[:_SWAPPED]]
-    return trials
+        trials += [[*rest, o] for o in p.ranking(rest, common)[:_SWAPPED]]
+    return [retune(p, t) for t in sorted(trials, key=p.score)[:_RETUNED]]
 
 
 def _at_all_joints(p: Problem, keys: list[int]) -> list[list[int]]:
@@ -276,7 +277,10 @@ def _prefer_plausible(p: Problem, keys: list[int]) -> list[int]:
 
 
 def _drop_unconfirmed(p: Problem, keys: list[int]) -> list[int]:
-    """Remove members, the least significant first, until all lower held-out errors."""
+    """
+    Replace members by simpler ones of their family, or remove them, the least significant first,
+    until all lower held-out errors.
+    """
     while keys:
         held = p.held_out(keys)
         t = [
@@ -289,8 +293,11 @@ def _drop_unconfirmed(p: Problem, keys: list[int]) -> list[int]:
         short = [x - (_CONFIRMED + _RARE * p.rarity[i]) for i, x in zip(keys, t, strict=True)]
         if min(short) > 0.0:
             break
-        rest = [i for i, x in zip(keys, short, strict=True) if x > min(short)]
-        keys = enforce_bounds(p, retune(p, rest))
+        worst = keys[int(np.argmin(short))]
+        rest = [i for i in keys if i != worst]
+        trials = [[*rest, o] for o in simpler_items(p, worst)]
+        keys = min((t for t in trials if np.isfinite(p.score(t))), key=p.score, default=rest)
+        keys = enforce_bounds(p, retune(p, keys))
     return keys
 
 
