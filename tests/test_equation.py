@@ -3,15 +3,18 @@
 import first_users
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 import servo_leg
+import small_robots as robots
 from measuring import measured
 
 from sb3_hds import Trajectories, diagnose, effects, twins
 from sb3_hds.core import rollout
 from sb3_hds.sysid.checks.conventions import other_convention
 from sb3_hds.sysid.checks.timing import match_logged_integrator
+from sb3_hds.sysid.diagnosis.preparation import prepare
 from sb3_hds.sysid.equation import members
 from sb3_hds.sysid.equation.assembly import assemble
 from sb3_hds.sysid.equation.effect_columns import impulse_weights
@@ -23,6 +26,7 @@ from sb3_hds.sysid.measurements import white_noise
 from sb3_hds.sysid.motion.joints import differences, kinematics
 from sb3_hds.sysid.motion.motion import smoothed_motion
 from sb3_hds.sysid.motion.smoothing import smooth
+from sb3_hds.sysid.progress import Bar
 
 
 def proposed(twin, data, calibrate=()):
@@ -383,3 +387,36 @@ def test_dry_friction_that_carries_the_torque_is_not_smoothed_by_sub_steps():
     assert sizes["viscous_friction.axis"]["b"].estimate == pytest.approx(4.0, rel=0.1)
     assert found.twin.substeps > twin.substeps
     assert any("sub-steps" in caveat for caveat in found.caveats)
+
+
+def test_a_link_that_is_lighter_than_in_the_file_is_named_and_no_gain_of_its_motors():
+    """An arm of three joints that follows set points, in MuJoCo's engine at 1 ms."""
+    arm = robots.chain(3)
+    model = mujoco.MjModel.from_xml_string(arm)
+    model.opt.timestep = 1e-3
+    link = model.body("link2").id
+    model.body_mass[link] *= 0.6
+    model.body_inertia[link] *= 0.6
+    model.dof_frictionloss[:] = [0.4, 0.4, 0.2]
+    data, rng, gear = mujoco.MjData(model), np.random.default_rng(0), np.array([10.0, 9.0, 8.0])
+    frequencies, phases = rng.uniform(0.15, 0.8, (3, 3)), rng.uniform(0.0, 6.0, (3, 3))
+    obs, actions = [], []
+    for k in range(2000):
+        target = 0.35 * np.sin(2.0 * np.pi * frequencies * 0.01 * k + phases).sum(0)
+        push = 30.0 * (target - data.qpos) - 2.0 * data.qvel + data.qfrc_bias
+        data.ctrl[:] = np.clip(push / gear, -1.0, 1.0)
+        obs.append([*data.qpos, *data.qvel])
+        actions.append(data.ctrl.copy())
+        mujoco.mj_step(model, data, 10)
+    obs.append([*data.qpos, *data.qvel])
+    twin = twins.from_mujoco(arm, dt=0.01)
+    data = Trajectories.from_arrays([np.array(obs)], [np.array(actions)], dt=0.01)
+
+    given = prepare(twin, data, effects.ALL, (), 0, Bar(False))
+
+    sizes = {m.key: m.sizes for m in given.screened.members}
+    assert {*sizes} == {f"coulomb_friction.j{i}" for i in range(3)} | {"parameter.link2_mass"}
+    assert sizes["parameter.link2_mass"]["link2_mass"] == pytest.approx(
+        -0.4 * twin.freed().values["link2_mass"], rel=0.1
+    )
+    assert given.nominal.masses == given.hypotheses.nominal.masses == ("link2",)

@@ -422,6 +422,33 @@ def test_a_twin_survives_its_spec_without_the_file():
     assert twins.from_mujoco(heavier, payload="lower", dt=0.01) != twin.base
 
 
+def test_a_freed_arm_is_the_same_arm_with_masses_and_centres_as_parameters():
+    arm = twins.from_mujoco(robots.chain(3), dt=0.01).with_parameters(j1_damping=0.7)
+
+    one = arm.extend(effects.ActionDelay("m0", delay=0.02)).freed(["link2_com_z", "j0_damping"])
+    every = arm.freed()
+
+    added = [name for name in one.parameters if name not in arm.parameters]
+    assert {"link2_mass", "link2_com_x"} < {*added} and all("link2" in name for name in added[:-1])
+    assert one.values["j1_damping"] == 0.7 and one.values["action_delay.m0.delay"] == 0.02
+    assert one.known_parameters == {name for name in added if "stretch" in name or "shear" in name}
+    assert every.masses == ("link0", "link1", "link2") and every.freed() is every
+    q, v, a = jnp.array([0.3, -0.5, 0.8]), jnp.array([1.0, -2.0, 0.5]), jnp.array([0.2, 0.1, -0.3])
+    stepped = [x.step(State(q, v, {}), a, x.params) for x in (arm, every)]
+    np.testing.assert_allclose(stepped[1].v, stepped[0].v, rtol=1e-5)
+    back = twins.from_spec(json.loads(json.dumps(one.to_spec())), effects.KNOWN)
+    assert back == one and back.base.masses == ("link2",)
+    with pytest.raises(ParameterError, match="masses names 'link9', which arm3 does not have"):
+        twins.from_mujoco(robots.chain(3), masses=["link9"])
+
+
+def test_a_centre_of_mass_stays_near_the_joints_of_its_link():
+    arm = twins.from_mujoco(robots.chain(2)).freed()
+    centre = arm.parameters["link0_com_z"]
+    # The next joint is 0.35 m away.
+    assert -0.1 < centre.lower < 0.0 and 0.35 < centre.upper < 0.45
+
+
 def test_masses_that_no_motion_tells_are_named():
     """Of a pendulum: its inertia about the hinge and two first moments."""
     pendulum = robots.robot("pendulum", """<body><joint name="hinge" axis="0 1 0"/>
