@@ -21,8 +21,8 @@ from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Moves that are tried from each set: best additions, best substitutes of a member, and rounds.
 _ADDED, _SWAPPED, _MOST_MOVES = 12, 5, 80
-# Of sets with one cause in place of two, so many are tried with new nonlinear parameters.
-_RETUNED = 3
+# Best causes in place of two, and how many of such sets are tried with new nonlinear parameters.
+_FOR_TWO, _RETUNED = 2, 3
 # Rarity from which members are retried without, and how many.
 _DOUBTFUL, _MOST_SHAKEN = 1.5, 4
 _VISCOUS, _DRY = "viscous_friction", "coulomb_friction"
@@ -131,16 +131,20 @@ def _swap(p: Problem, keys: list[int]) -> list[list[int]]:
 
 def _one_for_two(p: Problem, keys: list[int]) -> list[list[int]]:
     """
-    One candidate in place of two parameters of the twin: a mass for a first moment and an inertia,
-    a gain for two masses.
+    One candidate in place of two, of which one is a parameter of the twin: a mass for a first
+    moment and an inertia, a gain for two masses, a spring for a mass and an offset.
     """
     trials = []
-    own = [i for i in keys if i not in p.always and p.items[i].candidate.slot == PARAMETER]
-    others = {i: substitutes(p, keys, i) for i in own}
-    for one, other in itertools.combinations(own, 2):
+    open_to = [
+        i for i in keys if i not in p.always and p.items[i].candidate.name not in (_VISCOUS, _DRY)
+    ]
+    others = {i: substitutes(p, keys, i) for i in open_to}
+    for one, other in itertools.combinations(open_to, 2):
+        if PARAMETER not in (p.items[one].candidate.slot, p.items[other].candidate.slot):
+            continue
         rest = [m for m in keys if m not in (one, other)]
         common = sorted({*others[one]} & {*others[other]})
-        trials += [[*rest, o] for o in p.ranking(rest, common)[:_SWAPPED]]
+        trials += [[*rest, o] for o in p.ranking(rest, common)[:_FOR_TWO]]
     return [retune(p, t) for t in sorted(trials, key=p.score)[:_RETUNED]]
 
 
