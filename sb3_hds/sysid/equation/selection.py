@@ -51,17 +51,26 @@ def propose(problem: Problem) -> tuple[list[int], list[int]]:
     _, keys = min((_climb(problem, start) for start in _starts(problem)), key=lambda r: r[0])
     keys = _try_shared(problem, keys)
     keys = _retry_without_doubtful(problem, keys)
-    less_plausible: set[int] = set()
+    keys = _with_plausible(problem, keys)
     while True:
-        keys = _simplify(problem, _drop_negligible(problem, keys))
+        keys = _simplify(problem, _drop_unconfirmed(problem, keys))
         preferred = _prefer_plausible(problem, keys)
-        replaced = {*keys} - {*preferred} - less_plausible
-        if not replaced:
-            break
-        less_plausible |= replaced
-        _, keys = _climb(problem, preferred, less_plausible)
-    keys = _simplify(problem, _drop_unconfirmed(problem, preferred))
-    return _split_hints(problem, keys)
+        if preferred == keys:
+            return _split_hints(problem, keys)
+        keys = preferred
+
+
+def _with_plausible(p: Problem, keys: list[int]) -> list[int]:
+    """Replace members by equivalent ones with better prior odds, and climb again beside these."""
+    replaced: set[int] = set()
+    while True:
+        keys = _simplify(p, _drop_negligible(p, keys))
+        preferred = _prefer_plausible(p, keys)
+        families = {p.family(i) for i in {*keys} - {*preferred} - replaced}
+        if not families:
+            return preferred
+        replaced |= {i for i in range(len(p.items)) if p.family(i) in families}
+        _, keys = _climb(p, preferred, replaced)
 
 
 # ------------------------------------------------------------------------------ starts
@@ -116,7 +125,7 @@ def _climb(p: Problem, keys: list[int], barred: Collection[int] = ()) -> tuple[f
 
 def _add_or_drop(p: Problem, keys: list[int]) -> list[list[int]]:
     families = {p.family(i) for i in keys}
-    open_to = [i for i in p.ranking(keys) if p.family(i) not in families]
+    open_to = _best_of_each(p, [i for i in p.ranking(keys) if p.family(i) not in families])
     dropped = [[m for m in keys if m != i] for i in keys if i not in p.always]
     return [[*keys, i] for i in open_to[:_ADDED]] + dropped
 
@@ -125,8 +134,17 @@ def _swap(p: Problem, keys: list[int]) -> list[list[int]]:
     trials = []
     for i in (i for i in keys if i not in p.always):
         rest = [m for m in keys if m != i]
-        trials += [[*rest, o] for o in p.ranking(rest, substitutes(p, keys, i))[:_SWAPPED]]
+        others = _best_of_each(p, p.ranking(rest, substitutes(p, keys, i)))
+        trials += [[*rest, o] for o in others[:_SWAPPED]]
     return trials
+
+
+def _best_of_each(p: Problem, ranked: Sequence[int]) -> list[int]:
+    """:return: of items of the same candidate, which differ in nonlinear parameters, the first"""
+    best: dict[str, int] = {}
+    for i in ranked:
+        best.setdefault(p.items[i].key, i)
+    return [*best.values()]
 
 
 def _one_for_two(p: Problem, keys: list[int]) -> list[list[int]]:
