@@ -180,8 +180,9 @@ def test_members_of_a_set_have_other_sizes_where_one_of_them_is_left_out():
     assert alone.sizes["b"] > 3.5
     name = "viscous_friction.axis.b"
     assert both.sizes_of({alone.key}) == {name: pytest.approx(alone.sizes["b"])}
-    value, low, high = both.intervals_of(both.members[0])[name]
-    assert low < value == both.members[0].sizes["b"] < high
+    viscous = next(m for m in both.members if m.key == alone.key)
+    value, low, high = both.intervals_of(viscous)[name]
+    assert low < value == viscous.sizes["b"] < high
 
 
 @pytest.mark.parametrize("dry, every", [(4.0, 400), (8.0, 200), (10.0, 400), (8.0, 600)])

@@ -167,8 +167,8 @@ def test_one_mass_takes_the_place_of_a_moment_and_an_inertia():
     [
         # Commands are 40 ms late, which the equation of motion takes for a lag.
         ("pendulum", 24, {"parameter.mass", "action_delay.motor"}),
-        # It takes a gain of 0.77 for a scale of the encoder, read without velocities.
-        ("pendulum", 58, {"quadratic_drag.hinge", "coulomb_friction.hinge", "torque_gain.motor"}),
+        # A gain of 0.77, which is a greater mass with greater friction, and no encoder's scale.
+        ("pendulum", 58, {"quadratic_drag.hinge", "coulomb_friction.hinge", "parameter.mass"}),
         # Beside much viscous friction, dry friction lowers simulated errors by little, but surely.
         ("pendulum", 28, {"viscous_friction.hinge", "coulomb_friction.hinge", "motor_lag.motor"}),
     ],

@@ -33,6 +33,8 @@ _LEAST_LATE = 0.03
 # A spring may rest outside of the range of motion by this share of it: farther away, it is an
 # offset.
 _BEYOND = 0.5
+# Masses and lengths may be off by these factors.
+_LEAST_OF_IT, _MOST_OF_IT = 0.1, 5.0
 # Least noise of a velocity, in shares of the fastest joint's speed.
 _QUIETEST = 1e-6
 
@@ -223,8 +225,10 @@ def _bounds(h: Hypotheses, item: Item, name: str) -> tuple[float, float]:
     if item.candidate.slot == PARAMETER:
         place = item.candidate.place
         i = h.names.index(place)
-        value = h.nominal.values[place]
-        return h.lower[i] - value, h.upper[i] - value
+        value, low, high = h.nominal.values[place], h.lower[i], h.upper[i]
+        if item.candidate.index >= 0 and low > 0.0:
+            low, high = max(low, _LEAST_OF_IT * value), min(high, _MOST_OF_IT * value)
+        return low - value, high - value
     full = next(p for p in item.candidate.parameters if p.rpartition(".")[2] == name)
     i = h.names.index(full)
     low, high = h.lower[i] - h.null[i], h.upper[i] - h.null[i]
