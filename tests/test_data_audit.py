@@ -138,6 +138,8 @@ def test_repeated_samples_are_found(held, of, channel, share, data):
     finding = only(audit(changed(data, repeat), channels_of("PendulumReal")), "RepeatedSamples")
 
     assert finding.channel == channel and finding.share == pytest.approx(share, abs=0.03)
+    says = "All 3 channels repeat" if "," in channel else "'speed' repeats its last value"
+    assert says in str(finding) and "cos, sin" not in str(finding)
 
 
 def test_an_encoder_that_moves_slowly_repeats_no_samples_even_after_interpolation(tmp_path):

@@ -31,18 +31,25 @@ _MARGIN = 0.002  # of a joint's range: stops are soft, and sensors noisy
 
 @dataclasses.dataclass(frozen=True)
 class RepeatedSamples(Finding):
-    """:param share: of the samples of a moving channel that repeat the one before"""
+    """
+    :param share: of the samples of a moving channel that repeat the one before
+    :param n_channels: number of channels that do so at once
+    """
 
     share: float
+    n_channels: int = 1
 
     @property
     def sentence(self) -> str:
-        return (
-            f"'{self.channel}' repeats its last value while it moves, in {percent(self.share)} of "
-            f"its moving samples ({self.where})."
-        )
+        seen = f"{percent(self.share)} of the moving samples ({self.where})."
+        if self.n_channels > 1:
+            return f"All {self.n_channels} channels repeat their last values at once, in {seen}"
+        return f"'{self.channel}' repeats its last value while it moves, in {seen}"
 
-    remedy = "The sensor is read more often than it measures: log at its rate, or resample to it."
+    remedy = (
+        "The sensor is read more often than it measures, or messages are logged twice: log at its "
+        "rate, resample to it, or leave the repeated rows out."
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +142,7 @@ def repeated_samples(
     places = [set(finding.places) for finding in found]
     together = set.intersection(*places) if len(found) == len(names) > 1 else set()
     if len(together) > 0.8 * max(map(len, places), default=0):
-        return [RepeatedSamples(", ".join(names), found[0].places, found[0].share)]
+        return [RepeatedSamples(", ".join(names), found[0].places, found[0].share, len(names))]
     return found
 
 
