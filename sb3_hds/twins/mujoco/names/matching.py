@@ -1,32 +1,29 @@
 """Match the columns of a log to the signals of a twin, by names of joints, never by order."""
 
 import dataclasses
-import re
-from collections.abc import Iterable, Sequence
-from difflib import get_close_matches
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from sb3_hds.core import Trajectories
 from sb3_hds.errors import TrajectoryError
+from sb3_hds.twins.mujoco.names.renaming import common_affixes, likeness, renamed
+from sb3_hds.twins.mujoco.names.words import (
+    COMMAND,
+    EFFORT,
+    POSITION,
+    VELOCITY,
+    Parsed,
+    Signal,
+    tokens,
+)
 from sb3_hds.twins.mujoco.twin import MechanismTwin
 
-_POSITION, _VELOCITY, _EFFORT, _COMMAND = "position", "velocity", "effort", "command"
-# Their names in logs of ROS, LeRobot and others.
-_WORDS = {
-    _POSITION: ("position", "positions", "pos", "qpos", "q", "angle", "angles"),
-    _VELOCITY: ("velocity", "velocities", "vel", "qvel", "qd", "dq", "speed", "rate"),
-    _EFFORT: ("effort", "efforts", "torque", "torques", "tau", "force", "current"),
-    _COMMAND: (
-        *("command", "commands", "cmd", "target", "targets", "goal", "action", "setpoint"),
-        *("desired", "des", "reference", "ref", "control", "ctrl"),
-    ),
-}
-_KIND_OF = {word: kind for kind, words in _WORDS.items() for word in words}
-# Words that do not distinguish joints.
-_IGNORED = {"joint", "joints", "state", "states", "observation", "obs"}
-_COMMANDS = {"position": _POSITION, "velocity": _VELOCITY, "motor": _EFFORT, "dcmotor": _EFFORT}
+_COMMANDS = {"position": POSITION, "velocity": VELOCITY, "motor": EFFORT, "dcmotor": EFFORT}
+# A column that has at least this share of a joint's words may be that of the joint.
+_NEAR = 0.7
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,12 +33,16 @@ class Matching:
     :param actions: the column of each actuator; None if there is none
     :param missing: channels and actuators without a column, each with the nearest unused columns
     :param unused: columns without a channel or actuator
+    :param without: joints without any column, if all others have all of theirs
+    :param renamed: a sentence on what was taken away from names that differ by it; empty if nothing
     """
 
     obs: tuple[str | None, ...]
     actions: tuple[str | None, ...]
     missing: tuple[tuple[str, tuple[str, ...]], ...]
     unused: tuple[str, ...]
+    without: tuple[str, ...] = ()
+    renamed: str = ""
 
     def columns(self) -> dict[str, list[dict[str, str]]]:
         """
@@ -56,6 +57,11 @@ class Matching:
 
     def check(self) -> None:
         """:raises TrajectoryError: if anything is missing, with the nearest names"""
+        if self.without:
+            raise TrajectoryError(
+                f"The log has no columns of {', '.join(self.without)}. If they stand still in the "
+                f"data, pass lock={[*self.without]}."
+            )
         if self.missing:
             lines = [
                 f"  {name}" + (f": perhaps {' or '.join(near)}" if near else "")
@@ -73,14 +79,36 @@ def match(twin: MechanismTwin, names: Iterable[str]) -> Matching:
     :param names: of columns, such as ``"/joint_states:position[elbow_joint]"``, ``"elbow.pos"``,
         ``"dq_elbow"``; a name without a word for the quantity means the position
     """
-    columns = list(dict.fromkeys(names))
-    parsed = {name: _Parsed.of(name) for name in columns}
+    parsed = {name: Parsed.of(name) for name in names}
+    signals = _signals(twin)
+    hits, sentence = _matched(signals, parsed), ""
+    if not any(hits):
+        found = renamed(signals, parsed)
+        hits, sentence = ([*found.columns], found.sentence) if found else (hits, "")
+    unused = tuple(name for name in parsed if name not in hits)
+    n = len(twin.channels)
+    near = _nearest(signals, {name: parsed[name] for name in unused})
+    missing = tuple(
+        (signal.name if i < n else f"{signal.name} (command)", near[i])
+        for i, signal in enumerate(signals)
+        if hits[i] is None
+    )
+    pairs = list(zip(signals, hits, strict=True))
+    seen = {signal.joint for signal, hit in pairs if hit is not None}
+    lacking = dict.fromkeys(signal.joint for signal, hit in pairs if hit is None)
+    joints = {link.joint for link in twin.mechanism.links}
+    without = () if not seen or seen & {*lacking} or {*lacking} - joints else tuple(lacking)
+    return Matching(tuple(hits[:n]), tuple(hits[n:]), missing, unused, without, sentence)
+
+
+def _matched(signals: Sequence[Signal], parsed: Mapping[str, Parsed]) -> list[str | None]:
+    """The columns whose names contain those of the joints."""
     taken: set[str] = set()
 
-    def found(joint: str, kinds: Sequence[frozenset[str]]) -> str | None:
-        for kind in kinds:
-            alike = [name for name in columns if name not in taken and parsed[name].kinds == kind]
-            scores = {name: parsed[name].score(joint) for name in alike}
+    def found(signal: Signal) -> str | None:
+        for kinds in signal.kinds:
+            alike = [name for name in parsed if name not in taken and parsed[name].kinds == kinds]
+            scores = {name: parsed[name].score(signal.joint) for name in alike}
             best = max(scores.values(), default=0.0)
             first = [name for name, score in scores.items() if score == best > 0.0]
             if len(first) == 1:
@@ -88,27 +116,31 @@ def match(twin: MechanismTwin, names: Iterable[str]) -> Matching:
                 return first[0]
         return None
 
-    signals = _signals(twin)
     # Longer names first: a column of left_elbow does not belong to elbow.
-    order = sorted(range(len(signals)), key=lambda i: -len(_tokens(signals[i][1])))
+    order = sorted(range(len(signals)), key=lambda i: -len(tokens(signals[i].joint)))
     hits: dict[int, str | None] = {}
     for i in order:
-        _, joint, kinds = signals[i]
-        hits[i] = found(joint, kinds)
+        hits[i] = found(signals[i])
     # Other words must be the same in all names, like a namespace: right_elbow is not elbow.
-    rest = {i: parsed[name].rest(signals[i][1]) for i, name in hits.items() if name is not None}
+    rest = {i: parsed[name].rest(signals[i].joint) for i, name in hits.items() if name is not None}
     if len(set(rest.values())) > 1:
         hits |= {i: None for i, words in rest.items() if words}
-        taken = {name for name in hits.values() if name is not None}
-    unused = tuple(name for name in columns if name not in taken)
-    n = len(twin.channels)
-    missing = tuple(
-        (name if i < n else f"{name} (command)", tuple(get_close_matches(name, unused, 2, 0.4)))
-        for i, (name, _, _) in enumerate(signals)
-        if hits[i] is None
-    )
-    matched = [hits[i] for i in range(len(signals))]
-    return Matching(tuple(matched[:n]), tuple(matched[n:]), missing, unused)
+    return [hits[i] for i in range(len(signals))]
+
+
+def _nearest(signals: Sequence[Signal], unused: Mapping[str, Parsed]) -> list[tuple[str, ...]]:
+    """For each signal, up to two columns of its quantity that may be meant."""
+    own = common_affixes({Parsed.of(signal.joint).joint for signal in signals})
+    found = []
+    for signal in signals:
+        words = Parsed.of(signal.joint).joint
+        core = words[len(own.before) : len(words) - len(own.after)]
+        fitting = [name for name, column in unused.items() if column.kinds in signal.kinds]
+        scores = {name: likeness(core, unused[name].joint) for name in fitting}
+        best = max(scores.values(), default=0.0)
+        near = [name for name in fitting if scores[name] == best >= _NEAR]
+        found.append(tuple(near[:2]))
+    return found
 
 
 def arranged(twin: MechanismTwin, data: Trajectories) -> Trajectories:
@@ -127,6 +159,8 @@ def arranged(twin: MechanismTwin, data: Trajectories) -> Trajectories:
     actions = [f"{name} command" for name in report.actions]
     found = match(twin, [*report.obs, *actions])
     found.check()
+    if found.renamed:
+        warnings.warn(found.renamed, stacklevel=2)
     obs_at = [report.obs.index(str(name)) for name in found.obs]
     actions_at = [actions.index(str(name)) for name in found.actions]
     return dataclasses.replace(
@@ -137,61 +171,28 @@ def arranged(twin: MechanismTwin, data: Trajectories) -> Trajectories:
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class _Parsed:
-    """The words of a column's name."""
-
-    joint: tuple[str, ...]
-    kinds: frozenset[str]
-
-    @classmethod
-    def of(cls, name: str) -> "_Parsed":
-        words = _tokens(name)
-        kinds = frozenset(_KIND_OF[word] for word in words if word in _KIND_OF)
-        joint = tuple(word for word in words if word not in _KIND_OF and word not in _IGNORED)
-        return cls(joint, kinds or frozenset([_POSITION]))
-
-    def rest(self, joint: str) -> tuple[str, ...]:
-        """:return: words that are not in the name of the joint"""
-        own = _Parsed.of(joint).joint
-        return tuple(word for word in self.joint if word not in own)
-
-    def score(self, joint: str) -> float:
-        """:return: 0 for another joint, otherwise the share of the joint's words in the name"""
-        wanted = _Parsed.of(joint).joint
-        n = len(wanted)
-        if not n or not self.joint:
-            return float(self.joint == wanted)
-        inside = any(self.joint[i : i + n] == wanted for i in range(len(self.joint) - n + 1))
-        return n / len(self.joint) if inside else 0.0
-
-
-def _signals(twin: MechanismTwin) -> list[tuple[str, str, list[frozenset[str]]]]:
-    """Channels, then actuators: name, joint, and the quantities that a column may have."""
-    found: list[tuple[str, str, list[frozenset[str]]]] = []
+def _signals(twin: MechanismTwin) -> list[Signal]:
+    """Channels, then actuators."""
+    found = []
     for channel in twin.channels:
-        moving = channel.name.endswith(f"_{_VELOCITY}")
-        joint = channel.name.removesuffix(f"_{_VELOCITY}").removesuffix(f"_{_POSITION}")
-        found.append((channel.name, joint, [frozenset([_VELOCITY if moving else _POSITION])]))
+        moving = channel.name.endswith(f"_{VELOCITY}")
+        joint = channel.name.removesuffix(f"_{VELOCITY}").removesuffix(f"_{POSITION}")
+        kind = VELOCITY if moving else POSITION
+        found.append(Signal(channel.name, joint, (frozenset([kind]),)))
     names = iter(twin.actuators)
     for drive in twin.mechanism.drives:
-        kind = _COMMANDS.get(drive.role, _EFFORT)
-        kinds = [frozenset([_COMMAND, kind]), frozenset([_COMMAND])]
+        kind = _COMMANDS.get(drive.role, EFFORT)
+        kinds = [frozenset([COMMAND, kind]), frozenset([COMMAND])]
         link = twin.mechanism.links[drive.link]
         alone = sum(other.link == drive.link for other in twin.mechanism.drives) == 1
         joint = link.joint if alone and not link.quaternion else drive.name
         for _ in drive.inputs:
             own = next(names).name
-            found.append(
-                (own, joint if len(drive.inputs) == 1 else own, [*kinds, *_measured(kind)])
-            )
+            about = joint if len(drive.inputs) == 1 else own
+            found.append(Signal(own, about, (*kinds, *_measured(kind))))
     return found
 
 
 def _measured(kind: str) -> list[frozenset[str]]:
     """A measured effort can replace its command; a measured position cannot replace a target."""
-    return [frozenset([_EFFORT])] if kind == _EFFORT else []
-
-
-def _tokens(name: str) -> list[str]:
-    return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
+    return [frozenset([EFFORT])] if kind == EFFORT else []
