@@ -132,7 +132,7 @@ def _arguments_of(given: argparse.Namespace) -> list[str]:
     for option in ("twin", "model", "columns", "budget", "seed"):
         value = getattr(given, option)
         words += [] if value is None else [f"--{option}", str(value)]
-    for option in ("set", "actuators", "ignore", "calibrate", "effects"):
+    for option in ("set", *measured.MODEL_OPTIONS, "calibrate", "effects"):
         values = getattr(given, option)
         words += [f"--{option}", *values] if values else []
     return words
