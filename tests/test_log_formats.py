@@ -437,7 +437,7 @@ def test_an_uneven_first_column_that_always_rises_is_time(tmp_path, capsys):
         np.savetxt(tmp_path / f"{name}.csv", np.column_stack([first, other]), "%.6f", ",")
 
     assert "time: {column: '0'}" in described(capsys, tmp_path / "rising.csv")
-    assert "time: {column: '2'}" in described(capsys, tmp_path / "falling.csv")
+    assert "time: {column: '2'" in described(capsys, tmp_path / "falling.csv")
 
 
 def test_maps_of_bags_and_of_nested_files_are_printed_too(tmp_path, capsys):
