@@ -143,6 +143,22 @@ def test_joints_without_any_column_may_stand_still():
     assert not match(numbered("panda_joint{}"), half).without
 
 
+def test_columns_of_a_locked_joint_belong_to_no_other():
+    """Not to a joint whose name is within its own; and its position is known."""
+    xml = robots.chain(2).replace('"j0"', '"elbow"').replace('"j1"', '"left_elbow"')
+    twin = twins.from_mujoco(xml, lock="left_elbow")
+
+    found = match(twin, ["left_elbow_pos", "left_elbow_vel", "left_elbow_torque"])
+    assert not any([*found.obs, *found.actions]) and found.locked == ("left_elbow_pos",)
+    gripper = [f"/robot/{name}" for name in ("elbow_pos", "elbow_vel", "elbow_torque")]
+    found = match(twin, [*gripper, "/gripper/left_elbow_pos"])
+    assert (*found.obs, *found.actions) == tuple(gripper) and not found.missing
+
+    held = numbered("panda_joint{}", 4, lock="panda_joint4")
+    found = match(held, columns_of("fer_joint{}", (1, 2, 3, 4)))
+    assert not found.missing and found.locked == ("/joint_states:position[fer_joint4]",)
+
+
 def test_data_are_put_into_the_order_of_the_twin():
     obs = np.arange(12.0).reshape(2, 6)
     columns = [f"{name}_{kind}" for kind in ("vel", "pos") for name in reversed(NAMES)]

@@ -35,6 +35,7 @@ class Matching:
     :param unused: columns without a channel or actuator
     :param without: joints without any column, if all others have all of theirs
     :param renamed: a sentence on what was taken away from names that differ by it; empty if nothing
+    :param locked: the column of the position of each locked joint; None if there is none
     """
 
     obs: tuple[str | None, ...]
@@ -43,6 +44,7 @@ class Matching:
     unused: tuple[str, ...]
     without: tuple[str, ...] = ()
     renamed: str = ""
+    locked: tuple[str | None, ...] = ()
 
     def columns(self) -> dict[str, list[dict[str, str]]]:
         """
@@ -81,10 +83,15 @@ def match(twin: MechanismTwin, names: Iterable[str]) -> Matching:
     """
     parsed = {name: Parsed.of(name) for name in names}
     signals = _signals(twin)
-    hits, sentence = _matched(signals, parsed), ""
-    if not any(hits):
-        found = renamed(signals, parsed)
+    # Columns of locked joints belong to no other joint.
+    locked = [name for name, _ in twin.mechanism.locked]
+    every = [*signals, *(signal for name in locked for signal in _of_locked(name))]
+    hits, sentence = _matched(every, len(signals), parsed), ""
+    if not any(hits[: len(signals)]):
+        found = renamed(every, parsed)
         hits, sentence = ([*found.columns], found.sentence) if found else (hits, "")
+    standing = tuple(hits[len(signals) :: len(_of_locked(""))])
+    hits = hits[: len(signals)]
     unused = tuple(name for name in parsed if name not in hits)
     n = len(twin.channels)
     near = _nearest(signals, {name: parsed[name] for name in unused})
@@ -98,11 +105,23 @@ def match(twin: MechanismTwin, names: Iterable[str]) -> Matching:
     lacking = dict.fromkeys(signal.joint for signal, hit in pairs if hit is None)
     joints = {link.joint for link in twin.mechanism.links}
     without = () if not seen or seen & {*lacking} or {*lacking} - joints else tuple(lacking)
-    return Matching(tuple(hits[:n]), tuple(hits[n:]), missing, unused, without, sentence)
+    obs, actions = tuple(hits[:n]), tuple(hits[n:])
+    return Matching(obs, actions, missing, unused, without, sentence, standing)
 
 
-def _matched(signals: Sequence[Signal], parsed: Mapping[str, Parsed]) -> list[str | None]:
-    """The columns whose names contain those of the joints."""
+def _of_locked(joint: str) -> tuple[Signal, ...]:
+    """What a log may have of a joint that the twin lacks, its position first."""
+    kinds = (
+        [frozenset([POSITION])],
+        [frozenset([VELOCITY])],
+        [frozenset([COMMAND, kind]) for kind in (POSITION, EFFORT)] + [frozenset([COMMAND])],
+        [frozenset([EFFORT])],
+    )
+    return tuple(Signal(joint, joint, tuple(own)) for own in kinds)
+
+
+def _matched(signals: Sequence[Signal], n: int, parsed: Mapping[str, Parsed]) -> list[str | None]:
+    """The columns whose names contain those of the joints; the first ``n`` signals agree on it."""
     taken: set[str] = set()
 
     def found(signal: Signal) -> str | None:
@@ -122,7 +141,8 @@ def _matched(signals: Sequence[Signal], parsed: Mapping[str, Parsed]) -> list[st
     for i in order:
         hits[i] = found(signals[i])
     # Other words must be the same in all names, like a namespace: right_elbow is not elbow.
-    rest = {i: parsed[name].rest(signals[i].joint) for i, name in hits.items() if name is not None}
+    own = {i: name for i, name in hits.items() if name is not None and i < n}
+    rest = {i: parsed[name].rest(signals[i].joint) for i, name in own.items()}
     if len(set(rest.values())) > 1:
         hits |= {i: None for i, words in rest.items() if words}
     return [hits[i] for i in range(len(signals))]
