@@ -220,6 +220,21 @@ def test_locked_joints_reach_every_command_and_file(gripper, asked, tmp_path, ca
     assert lock[1] in diagnose._arguments_of(given)
 
 
+def test_a_locked_joint_that_the_log_has_elsewhere_is_a_warning(arm, capsys):
+    """The second joint of the arm moves by more than a radian."""
+    rows = np.loadtxt(arm / "log2.csv", delimiter=",", skiprows=1)
+    low, high = rows[:, 1].min(), rows[:, 1].max()
+    rows[:, 1] = 0.3
+    write(arm / "still.csv", "t,j1_pos,j0_pos,j0_vel,j1_vel,j0_target,j1_target", rows)
+
+    assert ask(arm, "audit", "--lock", "j1") == 0
+    assert f"j1 is locked at 0, but moves from {low:.3g} to {high:.3g}" in capsys.readouterr().err
+    assert ask(arm, "audit", "--lock", "j1", log="still.csv") == 0
+    assert "but stands at 0.3 in the data: --lock j1:0.3." in capsys.readouterr().err
+    assert ask(arm, "audit", "--lock", "j1:0.3", log="still.csv") == 0
+    assert "locked" not in capsys.readouterr().err
+
+
 @each(
     (["--twin", "Pendulum", "--lock", "hinge"], "--lock is about a model file"),
     (["--model", "ARM", "--lock", "j"], "--lock: no joint of the model has the name 'j'."),

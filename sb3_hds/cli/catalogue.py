@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_hds.cli import measured, models
 from sb3_hds.cli.arguments import settings
-from sb3_hds.cli.measured import MODEL_OPTIONS, add_model_options
 from sb3_hds.errors import ParameterError, did_you_mean
 
 if TYPE_CHECKING:
@@ -103,14 +103,14 @@ def add_twins(command: argparse.ArgumentParser) -> None:
         metavar="NAME:VALUE",
         help="parameters and options of the twin that is checked: mass:0.3 observe:q",
     )
-    add_model_options(command)
+    models.add_options(command)
     command.set_defaults(run=run_twins)
 
 
 def run_twins(given: argparse.Namespace) -> int:
     """:return: 1 where a check failed, else 0"""
     if given.words[:1] != ["check"]:
-        for option in ("set", *MODEL_OPTIONS):
+        for option in ("set", *models.OPTIONS):
             if getattr(given, option):
                 raise ParameterError(
                     f"--{option} changes the twin that is checked: twins check NAME --{option} ..."
@@ -122,10 +122,9 @@ def run_twins(given: argparse.Namespace) -> int:
             "Name one twin, as in 'sb3-hds twins check Pendulum' or 'sb3-hds twins check "
             f"my_module:MyTwin', got '{' '.join(given.words)}'."
         )
-    from sb3_hds.cli.measured import twin_called
     from sb3_hds.twins import check
 
-    found = check(twin_called(given.words[1], settings("--set", given.set), given))
+    found = check(measured.twin_called(given.words[1], settings("--set", given.set), given))
     print(found)
     return 0 if found.ok else 1
 

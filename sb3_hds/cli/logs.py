@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from sb3_hds.cli import measured
+from sb3_hds.cli import measured, models
 from sb3_hds.errors import ParameterError
 
 
@@ -19,7 +19,7 @@ def add_columns(command: argparse.ArgumentParser) -> None:
         help="MJCF or URDF file of a robot, for whose joints the map is; with --lock and the like",
     )
     measured.add_set(command)
-    measured.add_model_options(command)
+    models.add_options(command)
     command.set_defaults(run=run_columns)
 
 
@@ -28,9 +28,9 @@ def run_columns(given: argparse.Namespace) -> None:
     from sb3_hds.data.overview import describe
 
     if given.model is None:
-        measured.refuse_model_options(given)
+        models.refuse_options(given)
     path = Path(given.file).expanduser()
-    suggested = None if given.model is None else measured.map_for_model(given, str(path))
+    suggested = None if given.model is None else models.map_for_model(given, str(path))
     print(describe(path, given.records, given.skip, suggested))
 
 
