@@ -213,9 +213,13 @@ def test_locked_joints_reach_every_command_and_file(gripper, asked, tmp_path, ca
         cli.main(["diagnose", "--twin", str(file), "--data", str(log), "--columns", str(told)])
         == 130
     )
-    ((twin, _),) = asked
+    twin, _ = asked[0]
     assert [joint.name for joint in twin.joints] == ["rob_joint1", "rob_joint2"]
     assert twin.mechanism.locked[0] == ("rob_left_finger", (0.03,))
+    # Its joints are found by name, too.
+    assert cli.main(["diagnose", "--twin", str(file), "--data", str(log)]) == 130
+    assert "'arm_joint1_pos' is rob_joint1_position." in capsys.readouterr().out
+    np.testing.assert_array_equal(asked[1][1].obs, asked[0][1].obs)
     given = cli.parser().parse_args(["diagnose", *about, "--each", str(tmp_path)])
     assert lock[1] in diagnose._arguments_of(given)
 

@@ -71,7 +71,9 @@ def twin_and_data(given: argparse.Namespace) -> "tuple[Twin, Trajectories]":
     if given.model is not None:
         return models.model_and_data(given, partial(data_of, given))
     models.refuse_options(given)
-    return twin_of(given), data_of(given, given.columns)
+    twin, load = twin_of(given), partial(data_of, given)
+    named = models.data_by_name(given, twin, load) if given.columns is None else None
+    return twin, load(given.columns) if named is None else named
 
 
 def data_of(given: argparse.Namespace, columns: Any) -> "Trajectories":

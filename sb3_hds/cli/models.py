@@ -11,7 +11,7 @@ from sb3_hds.cli.arguments import names, positions, settings, with_options
 from sb3_hds.errors import ModelFileError, ParameterError, TrajectoryError, first_names
 
 if TYPE_CHECKING:
-    from sb3_hds.core import Trajectories
+    from sb3_hds.core import Trajectories, Twin
     from sb3_hds.data.overview import ChannelCandidates
     from sb3_hds.twins.mujoco import Matching, MechanismTwin
 
@@ -103,6 +103,41 @@ def model_and_data(
         data = load(given.columns)
         return make({"dt": data.dt} | own), data
     twin, found = _matched(make, own, named)
+    data = _loaded(load, twin, found, named)
+    return make({"dt": data.dt, "observe": twin.observed} | own), data
+
+
+def data_by_name(
+    given: argparse.Namespace, twin: "Twin", load: Callable[[Any], "Trajectories"]
+) -> "Trajectories | None":
+    """
+    The data in the order of the signals of a robot's twin in a file of ``--json`` or ``--write``.
+
+    :return: None for another twin, or data that need no map
+    :raises TrajectoryError: for signals of the twin that the log lacks by name, with the remedy
+    """
+    from sb3_hds.core.twin import plant_of
+    from sb3_hds.data.load import first_log
+    from sb3_hds.data.overview import channel_candidates
+    from sb3_hds.twins.mujoco import MechanismTwin, match
+
+    plant = plant_of(twin)
+    if not isinstance(plant, MechanismTwin):
+        return None
+    log = first_log(given.data, None)
+    if log is None or (log.columns is not None and log.columns.obs is not None):
+        return None
+    named = channel_candidates(given.data)
+    return named and _loaded(load, plant, match(plant, _names_in(named)), named)
+
+
+def _loaded(
+    load: Callable[[Any], "Trajectories"],
+    twin: "MechanismTwin",
+    found: "Matching",
+    named: "ChannelCandidates",
+) -> "Trajectories":
+    """The data in the order of the signals, or the error that leads there."""
     if found.without:
         raise TrajectoryError(
             f"The log has no columns of {', '.join(found.without)}. If they stand still in the "
@@ -119,7 +154,7 @@ def model_and_data(
     for sentence in (*named.guessed, *filter(None, [found.renamed])):
         print(sentence)
     _check_locked(load, twin, found, named)
-    return make({"dt": data.dt, "observe": twin.observed} | own), data
+    return data
 
 
 def _check_locked(
@@ -171,9 +206,7 @@ def _matched(
     """Match the log to the twin; without velocities in it, only positions are observed."""
     from sb3_hds.twins.mujoco import match
 
-    columns = [entry.name for entry in named.observed]
-    columns += [f"{entry.name}{_COMMAND}" for entry in named.commanded]
-    twin = make(own)
+    columns, twin = _names_in(named), make(own)
     found = match(twin, columns)
     velocities = {c.name for c in twin.channels if c.name.endswith("_velocity")}
     unseen = bool(velocities) and velocities <= {name for name, _ in found.missing}
@@ -181,6 +214,12 @@ def _matched(
         twin = make({**own, "observe": "q"})
         found = match(twin, columns)
     return twin, found
+
+
+def _names_in(named: "ChannelCandidates") -> list[str]:
+    """Names of entries, with a word behind those of commands."""
+    commands = [f"{entry.name}{_COMMAND}" for entry in named.commanded]
+    return [*(entry.name for entry in named.observed), *commands]
 
 
 def _commands(found: "Matching", named: "ChannelCandidates") -> list[str]:

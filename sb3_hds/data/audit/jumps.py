@@ -93,8 +93,8 @@ class ReinitialisedState(Finding):
         )
 
     remedy = (
-        "The state was reset within the recording: audit.corrected(data), or --correct, cuts there. Or "
-        "name the column that counts episodes when loading."
+        "The state was reset within the recording: audit.corrected(data), or --correct, cuts "
+        "there. Or name the column that counts episodes when loading."
     )
 
 
