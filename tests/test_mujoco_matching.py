@@ -139,6 +139,10 @@ def test_joints_without_any_column_may_stand_still():
             TrajectoryError, match=r"no columns of panda_joint3\. .*lock=\['panda_joint3'\]"
         ):
             found.check()
+    # If all that is left is not another joint of the same kind.
+    for shifted in ("panda_joint{}", "robot/panda_joint{}"):
+        found = match(numbered("panda_joint{}"), columns_of(shifted, (2, 3, 4)))
+        assert found.obs[0] is None and not found.without
     half = columns_of("panda_joint{}")[1:]
     assert not match(numbered("panda_joint{}"), half).without
 

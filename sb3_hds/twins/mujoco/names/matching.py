@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_hds.core import Trajectories
 from sb3_hds.errors import TrajectoryError
-from sb3_hds.twins.mujoco.names.renaming import common_affixes, likeness, renamed
+from sb3_hds.twins.mujoco.names.renaming import common_affixes, form, likeness, renamed
 from sb3_hds.twins.mujoco.names.words import (
     COMMAND,
     EFFORT,
@@ -105,6 +105,8 @@ def match(twin: MechanismTwin, names: Iterable[str]) -> Matching:
     lacking = dict.fromkeys(signal.joint for signal, hit in pairs if hit is None)
     joints = {link.joint for link in twin.mechanism.links}
     without = () if not seen or seen & {*lacking} or {*lacking} - joints else tuple(lacking)
+    if not sentence and _another([s for s, _ in pairs], [parsed[name] for name in unused]):
+        without = ()
     obs, actions = tuple(hits[:n]), tuple(hits[n:])
     return Matching(obs, actions, missing, unused, without, sentence, standing)
 
@@ -146,6 +148,19 @@ def _matched(signals: Sequence[Signal], n: int, parsed: Mapping[str, Parsed]) ->
     if len(set(rest.values())) > 1:
         hits |= {i: None for i, words in rest.items() if words}
     return [hits[i] for i in range(len(signals))]
+
+
+def _another(signals: Sequence[Signal], unused: Sequence[Parsed]) -> bool:
+    """Whether an unused column may be of a joint that differs by a number: joint8 of joint1."""
+    forms = {form(Parsed.of(signal.joint).joint) for signal in signals}
+    kinds = {kind for signal in signals for kind in signal.kinds}
+    ends = {
+        form(column.joint)[i:]
+        for column in unused
+        if column.kinds in kinds
+        for i in range(len(column.joint))
+    }
+    return bool(forms & ends)
 
 
 def _nearest(signals: Sequence[Signal], unused: Mapping[str, Parsed]) -> list[tuple[str, ...]]:

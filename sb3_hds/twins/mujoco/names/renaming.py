@@ -104,6 +104,11 @@ def likeness(joint: Words, column: Words) -> float:
     return sum(max((_alike(a, b) for b in column), default=0.0) for a in joint) / len(joint)
 
 
+def form(core: Words) -> Words:
+    """:return: the words with any number for a number"""
+    return tuple("0" if word.isdigit() else word for word in core)
+
+
 def _common(names: Sequence[Words]) -> Words:
     shortest = min(map(len, names), default=0)
     same = itertools.takewhile(lambda words: len(set(words)) == 1, zip(*names, strict=False))
@@ -131,17 +136,13 @@ def _contradict(one: Affixes, other: Affixes) -> bool:
 def _another(affixes: Affixes, cores: Iterable[Words], columns: Iterable[Parsed]) -> bool:
     """Whether a column with these affixes differs from those of all joints by a number only."""
     own = set(cores)
-    forms = {_form(core) for core in own}
+    forms = {form(core) for core in own}
     n_before, n_after = len(affixes.before), len(affixes.after)
     for name in {column.joint for column in columns}:
         core = name[n_before : len(name) - n_after]
-        if core and affixes.around(core) == name and core not in own and _form(core) in forms:
+        if core and affixes.around(core) == name and core not in own and form(core) in forms:
             return True
     return False
-
-
-def _form(core: Words) -> Words:
-    return tuple("0" if word.isdigit() else word for word in core)
 
 
 def _column_of(words: Words, signal: Signal, parsed: Mapping[str, Parsed]) -> str | None:
