@@ -430,7 +430,7 @@ def test_what_is_printed_of_a_log_is_a_map_that_reads_it(tmp_path, capsys):
 
 def test_an_uneven_first_column_that_always_rises_is_time(tmp_path, capsys):
     """Without names; rather than a steadier one behind it, unless it stands still."""
-    times = 1017.78 + np.cumsum(np.random.default_rng(0).choice([0.008, 0.01, 0.012], N))
+    times = 1017.78 + np.cumsum(np.random.default_rng(0).choice([0.01, 0.01, 0.012], N))
     other = np.column_stack([np.sin(40.0 * times), 1.0 * np.arange(N)])
     held = np.where(np.arange(N) == 5, times[4], times)
     for name, first in (("rising", times), ("held", held)):

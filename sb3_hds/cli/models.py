@@ -167,7 +167,7 @@ def _check_locked(
     import numpy as np
 
     pairs = zip(twin.mechanism.locked, found.locked, strict=True)
-    known = {column: locked for locked, column in pairs if column is not None}
+    known = {x: locked for locked, x in pairs if x is not None and len(locked[1]) == 1}
     if not known:
         return
     with warnings.catch_warnings():
@@ -175,7 +175,7 @@ def _check_locked(
         warnings.simplefilter("ignore")
         data = load(named.chosen(known, []))
     seen = np.concatenate([data.episode(i)[0] for i in range(len(data))])
-    for (name, (at, *_)), x in zip(known.values(), seen.T, strict=True):
+    for (name, (at,)), x in zip(known.values(), seen.T, strict=True):
         low, high, middle = x.min(), x.max(), np.median(x)
         remedy = f"stands at {middle:.3g} in the data: --lock {name}:{middle:.3g}"
         if high - low > _STILL:

@@ -118,8 +118,8 @@ def _disabled(model: Any) -> set[str]:
 def _link(
     model: Any, j: int, kind: str, parent: int, turn: Any, way: Any, off: set[str]
 ) -> dict[str, Any]:
-    n_q, n_v = SIZES[kind]
     q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+    n_q, n_v = SIZES[kind]
     single, free = kind in (HINGE, SLIDE), kind == FREE
     armature, damping = _of_actuators(model, j)
     dampings = _with_powers(model, "dof_damping")[v : v + n_v] + damping
