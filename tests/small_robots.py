@@ -155,6 +155,20 @@ URDF = """<?xml version="1.0"?>
 </robot>
 """
 
+_FINGER = '<limit lower="0" upper="0.04" effort="20" velocity="1"/>'
+_FINGERS = "".join(
+    f"""<link name="{side}_finger"><inertial><mass value="0.1"/><origin xyz="0 0.01 0.02"/>
+    <inertia ixx="1e-4" iyy="1e-4" izz="2e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="{side}_finger" type="prismatic"><parent link="tool"/><child link="{side}_finger"/>
+    <origin xyz="0 0 0.05"/><axis xyz="0 {y} 0"/>{_FINGER}{more}</joint>"""
+    for side, y, more in (
+        ("left", 1, ""),
+        ("right", 1, '<mimic joint="left_finger" multiplier="-2" offset="0.01"/>'),
+    )
+)
+#: two hinges and two fingers, of which the right one follows the left one
+GRIPPER_URDF = URDF.replace("</robot>", f"{_FINGERS}</robot>")
+
 
 def compiled(xml, **options):
     """:param options: of the model: ``integrator``, ``timestep``"""

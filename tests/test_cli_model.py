@@ -1,14 +1,17 @@
 """A robot's model file on the command line: joints matched by name, a corrected file written."""
 
 import json
+import re
 
 import mujoco
 import numpy as np
 import pytest
 import small_robots as robots
+import yaml
 from cases import each
 
 from sb3_hds import cli
+from sb3_hds.cli import diagnose
 
 SERVOS = ["--actuators", "position", "kp:30", "kv:1.5"]
 
@@ -97,15 +100,16 @@ def test_a_diagnosis_takes_joints_by_name_at_the_interval_of_the_log(arm, asked,
 
 
 def test_names_of_joints_come_from_the_map_where_the_log_has_none(arm, asked, tmp_path, capsys):
+    """The map of the error is corrected: columns are filled in, and velocities left out."""
     assert ask(arm, "audit", log="q.csv") == 1
-    told = capsys.readouterr().err
-    assert "No column of the log has the name of:" in told
-    assert "obs: [{column: NAME, name: j0_position}, ...]" in told
-    entry = "{{column: {}, name: {}}}".format
-    obs = ", ".join([entry("a", "j1_position"), entry("b", "j0_position")])
-    actions = ", ".join([entry("c", "j0"), entry("d", "j1")])
+    told, _, offered = capsys.readouterr().err.partition("\n\n")
+    assert "has the name of j0_position, j1_position, j0_velocity and 3 more" in told
+    assert yaml.safe_load(offered)["time"] == {"column": "t"}
+    assert "# other columns: a, b, c, d\n" in offered
+    lines = [line for line in offered.splitlines() if "_velocity" not in line]
+    columns = iter(["b", "a", "c", "d"])
     chart = tmp_path / "map.yml"
-    chart.write_text(f"time: t\nobs: [{obs}]\nactions: [{actions}]\n")
+    chart.write_text("\n".join(re.sub("NAME", lambda _: next(columns), line) for line in lines))
 
     assert ask(arm, "diagnose", "--columns", chart, log="q.csv") == 130
 
@@ -115,7 +119,133 @@ def test_names_of_joints_come_from_the_map_where_the_log_has_none(arm, asked, tm
     np.testing.assert_allclose(data.obs[0, :5], rows[:5, [2, 1]])
 
 
+def test_columns_of_a_map_without_names_are_offered_by_their_place(arm, asked, tmp_path, capsys):
+    """In the order of the twin, with what the map says of them."""
+    chart, named = tmp_path / "map.yml", tmp_path / "named.yml"
+    numbered = tmp_path / "log.csv"
+    rows = np.loadtxt(arm / "log2.csv", delimiter=",", skiprows=1)
+    np.savetxt(numbered, rows, "%.9f", ",")
+    chart.write_text(
+        "time: 0\nobs: [2, 1, {column: 3, unit: deg/s}, 4]\nactions: [{column: 5, scale: 2}, 6]"
+    )
+
+    assert ask(arm, "audit", "--columns", chart, log=numbered) == 1
+    named.write_text(capsys.readouterr().err.partition("\n\n")[2])
+    assert ask(arm, "diagnose", "--columns", named, log=numbered) == 130
+
+    ((_, data),) = asked
+    assert "{column: '3', unit: deg/s, name: j0_velocity}  # by its place" in named.read_text()
+    expected = rows[:5, [2, 1, 3, 4]] * [1.0, 1.0, np.pi / 180.0, 1.0]
+    np.testing.assert_allclose(data.obs[0, :5], expected)
+    np.testing.assert_allclose(data.actions[0, :5], rows[:5, 5:] * [2.0, 1.0])
+
+
+def test_a_map_for_a_model_is_printed_and_understood(arm, asked, tmp_path, capsys):
+    chart, log = tmp_path / "map.yml", str(arm / "log2.csv")
+    words = ["--model", str(arm / "arm2.xml"), *SERVOS]
+
+    assert cli.main(["columns", log, *words]) == 0
+    chart.write_text(capsys.readouterr().out)
+    assert ask(arm, "diagnose", "--columns", chart) == 130
+
+    names = [entry["name"] for entry in yaml.safe_load(chart.read_text())["obs"]]
+    assert names == [channel.name for channel in asked[0][0].channels]
+    assert asked[0][1].report.obs == tuple(names)
+    assert cli.main(["columns", log, "--lock", "j0"]) == 1
+    assert "--lock is about a model file" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def gripper(tmp_path_factory):
+    """A URDF with two fingers, and a log that calls its joints otherwise and has no fingers."""
+    folder = tmp_path_factory.mktemp("gripper")
+    text = robots.GRIPPER_URDF.replace('"shoulder"', '"rob_joint1"').replace(
+        '"elbow"', '"rob_joint2"'
+    )
+    (folder / "robot.urdf").write_text(re.sub('"(left|right)_finger"', r'"rob_\1_finger"', text))
+    head = [f"arm_joint{i}_{kind}" for kind in ("pos", "vel", "torque") for i in (1, 2)]
+    time = np.arange(400) * 0.01
+    q = np.stack([np.sin(3.0 * time), np.cos(5.0 * time)], 1)
+    rows = np.column_stack([time, q, np.gradient(q, 0.01, axis=0), np.sign(q)])
+    write(folder / "log.csv", ",".join(["t", *head]), rows)
+    return folder
+
+
+def test_a_robot_with_a_gripper_gets_there_by_what_the_messages_say(gripper, asked, capsys):
+    """From coupled fingers that the log lacks, and joints of other names, to a diagnosis."""
+    command = ["diagnose", "--model", gripper / "robot.urdf", "--data", gripper / "log.csv"]
+    command = list(map(str, command))
+    lock = "pass --lock rob_left_finger rob_right_finger"
+
+    assert cli.main(command) == 1
+    told = capsys.readouterr().err
+    assert f"If they stand still in the data, {lock}." in told and "--ignore equality." in told
+    assert cli.main([*command, "--ignore", "equality"]) == 1
+    told = capsys.readouterr().err
+    assert "The log has no columns of rob_left_finger, rob_right_finger. " in told and lock in told
+    assert cli.main([*command, *lock.split()[1:]]) == 130
+
+    shown = capsys.readouterr().out
+    assert "without 'arm_' and 'rob_': 'arm_joint1_pos' is rob_joint1_position." in shown
+    ((twin, data),) = asked
+    assert [joint.name for joint in twin.joints] == ["rob_joint1", "rob_joint2"]
+    rows = np.loadtxt(gripper / "log.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(data.obs[0, :5], rows[:5, 1:5])
+    # In the second row the joints move towards opposite torques.
+    np.testing.assert_allclose(data.actions[0, 1:5], rows[1:5, 5:])
+
+
+def test_locked_joints_reach_every_command_and_file(gripper, asked, tmp_path, capsys, monkeypatch):
+    robot, log, file = gripper / "robot.urdf", gripper / "log.csv", tmp_path / "twin.json"
+    lock = ["--lock", "*_left_finger:0.03"]
+    about = ["--model", str(robot), "--data", str(log), *lock]
+    told = tmp_path / "map.yml"
+
+    assert cli.main(["audit", *about]) == 0
+    assert cli.main(["twins", "check", str(robot), *lock, "--set", "dt:0.01"]) == 0
+    capsys.readouterr()
+    assert cli.main(["columns", str(log), "--model", str(robot), *lock]) == 0
+    told.write_text(capsys.readouterr().out)
+    words = ["--free", "rob_joint1_damping", "--errors", "force", "--write", str(file)]
+    assert cli.main(["calibrate", *about, "--columns", str(told), *words]) == 0
+    # The file stands for the twin, with its locked joints.
+    assert (
+        cli.main(["diagnose", "--twin", str(file), "--data", str(log), "--columns", str(told)])
+        == 130
+    )
+    twin, _ = asked[0]
+    assert [joint.name for joint in twin.joints] == ["rob_joint1", "rob_joint2"]
+    assert twin.mechanism.locked[0] == ("rob_left_finger", (0.03,))
+    # Its joints are found by name, too.
+    assert cli.main(["diagnose", "--twin", str(file), "--data", str(log)]) == 130
+    assert "'arm_joint1_pos' is rob_joint1_position." in capsys.readouterr().out
+    np.testing.assert_array_equal(asked[1][1].obs, asked[0][1].obs)
+    given = cli.parser().parse_args(["diagnose", *about, "--each", str(tmp_path)])
+    assert lock[1] in diagnose._arguments_of(given)
+
+
+def test_a_locked_joint_that_the_log_has_elsewhere_is_a_warning(arm, capsys):
+    """The second joint of the arm moves by more than a radian."""
+    rows = np.loadtxt(arm / "log2.csv", delimiter=",", skiprows=1)
+    low, high = rows[:, 1].min(), rows[:, 1].max()
+    rows[:, 1] = 0.3
+    write(arm / "still.csv", "t,j1_pos,j0_pos,j0_vel,j1_vel,j0_target,j1_target", rows)
+
+    assert ask(arm, "audit", "--lock", "j1") == 0
+    assert f"j1 is locked at 0, but moves from {low:.3g} to {high:.3g}" in capsys.readouterr().err
+    assert ask(arm, "audit", "--lock", "j1", log="still.csv") == 0
+    assert "but stands at 0.3 in the data: --lock j1:0.3." in capsys.readouterr().err
+    assert ask(arm, "audit", "--lock", "j1:0.3", log="still.csv") == 0
+    assert "locked" not in capsys.readouterr().err
+
+
 @each(
+    (["--twin", "Pendulum", "--lock", "hinge"], "--lock is about a model file"),
+    (["--model", "ARM", "--lock", "j"], "--lock: no joint of the model has the name 'j'."),
+    (
+        ["--model", "ARM", "--lock", "j1:open"],
+        "--lock: no joint of the model has the name 'j1:open'",
+    ),
     (["--twin", "Pendulum", "--ignore", "limits"], "--ignore is about a model file"),
     (["--model", "missing.urdf"], "There is no file 'missing.urdf'"),
     (["--model", "ARM", "--actuators", "magic"], "actuators is one of 'torque'"),

@@ -1,5 +1,7 @@
 """The clock behind time stamps is found, and no row moves farther than its stamp is off."""
 
+import re
+
 import numpy as np
 import pytest
 from cases import each
@@ -222,3 +224,21 @@ def test_a_wrapped_angle_is_refused_only_where_it_is_interpolated_at_its_seam():
         read(t, values=[angle], dt=0.004)
     [obs], _, _ = read(t, values=[angle], dt=0.004, obs=[{"column": "q", "angle": True}])
     np.testing.assert_allclose(np.unwrap(obs), 0.02 * np.arange(len(obs)), atol=1e-9)
+
+
+def test_of_many_channels_the_one_that_interpolation_changes_most_is_named():
+    """White noise, relative to its standard deviation; of a few channels, all are named."""
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.008, 0.012, 500))
+    smooth = motion(t)[:, None] * [1.0, 2.0, 50.0, 3.0]
+    obs = np.column_stack([smooth, rng.normal(size=len(t))])
+    names = ["a", "b", "c", "d", "noise"]
+
+    def summary(n):
+        rows = Rows("log", np.arange(len(t)), t, obs[:, n:], np.zeros((len(t), 1)), "")
+        return resample([rows], columns_from(COLUMNS | {"obs": names[n:]})).report.summary()
+
+    # Linear interpolation averages neighbours, and so loses a large part of white noise.
+    share, worst = re.search(r"at most (\S+) % of a channel.* \((\w+) ", summary(0)).groups()
+    assert worst == "noise" and 20.0 < float(share) < 100.0
+    assert re.search("b [^ ]+, c [^ ]+, d [^ ]+, noise ", summary(1))

@@ -125,19 +125,38 @@ def some_held(k):
 
 
 @each(
-    (some_held, slice(3), "cos, sin, speed", 0.1),
-    (lambda k: k // 2 * 2, slice(3), "cos, sin, speed", 0.5),
-    (lambda k: k // 4 * 4, [2], "speed", 0.75),
+    (some_held, slice(3), ["cos", "sin", "speed"], 0.1),
+    (lambda k: k // 2 * 2, slice(3), ["cos", "sin", "speed"], 0.5),
+    (lambda k: k // 4 * 4, [2], ["speed"], 0.75),
     ids=["some", "half the rate", "one channel"],
 )
-def test_repeated_samples_are_found(held, of, channel, share, data):
+def test_repeated_samples_are_found(held, of, channels, share, data):
     def repeat(_, obs, actions):
         obs[:, of] = obs[held(np.arange(len(obs)))][:, of]
         return obs, actions
 
     finding = only(audit(changed(data, repeat), channels_of("PendulumReal")), "RepeatedSamples")
 
-    assert finding.channel == channel and finding.share == pytest.approx(share, abs=0.03)
+    assert [finding.channel, *finding.others] == channels
+    assert finding.share == pytest.approx(share, abs=0.03)
+    says = "All 3 channels repeat" if finding.at_once else "'speed' repeats its last value"
+    assert says in str(finding) and "cos, sin" not in str(finding)
+
+
+def test_many_channels_that_repeat_samples_are_one_finding():
+    """Each at its own samples, next to one that does not."""
+    rng = np.random.default_rng(0)
+    k, obs = np.arange(500), []
+    for i in range(6):
+        held = k - np.r_[False, rng.random(499) < (0.05 + 0.02 * i)] * (i < 5)
+        obs.append(np.sin(0.02 * held + i))
+    data = Trajectories.from_arrays([np.stack(obs, 1)], [np.ones((499, 1))], dt=0.01)
+
+    finding = only(audit(data, [Channel(name, "rad") for name in "abcdef"]), "RepeatedSamples")
+
+    assert (finding.channel, finding.others, finding.at_once) == ("a", tuple("bcde"), False)
+    assert finding.share == pytest.approx(0.13, abs=0.04)
+    assert "a, b, c and 2 more repeat their last values while they move" in str(finding)
 
 
 def test_an_encoder_that_moves_slowly_repeats_no_samples_even_after_interpolation(tmp_path):

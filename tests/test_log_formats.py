@@ -428,6 +428,18 @@ def test_what_is_printed_of_a_log_is_a_map_that_reads_it(tmp_path, capsys):
     assert data.dt == 0.01
 
 
+def test_an_uneven_first_column_that_always_rises_is_time(tmp_path, capsys):
+    """Without names; rather than a steadier one behind it, unless it stands still."""
+    times = 1017.78 + np.cumsum(np.random.default_rng(0).choice([0.01, 0.01, 0.012], N))
+    other = np.column_stack([np.sin(40.0 * times), 1.0 * np.arange(N)])
+    held = np.where(np.arange(N) == 5, times[4], times)
+    for name, first in (("rising", times), ("held", held)):
+        np.savetxt(tmp_path / f"{name}.csv", np.column_stack([first, other]), "%.6f", ",")
+
+    assert "time: {column: '0'}" in described(capsys, tmp_path / "rising.csv")
+    assert "time: {column: '2'" in described(capsys, tmp_path / "held.csv")
+
+
 def test_maps_of_bags_and_of_nested_files_are_printed_too(tmp_path, capsys):
     write_bag(tmp_path / "bag", joint_states())
     (tmp_path / "log.json").write_text(json.dumps({"data": EPISODES}))

@@ -83,7 +83,7 @@ def _warn(
 
 def parser() -> argparse.ArgumentParser:
     """:return: the parser of ``sb3-hds`` and its commands"""
-    from sb3_hds.cli import calibrate, catalogue, deployment, diagnose, logs, robustness, study
+    from sb3_hds.cli import calibrate, catalogue, deployment, diagnose, logs, study
     from sb3_hds.cli.arguments import Parser, Version
 
     top = Parser(
@@ -96,7 +96,7 @@ def parser() -> argparse.ArgumentParser:
         ("diagnose", diagnose.add_arguments, "name the cause, from measured data"),
         ("audit", logs.add_audit, "find defects in measured data"),
         ("calibrate", calibrate.add_arguments, "estimate parameters of a twin from measured data"),
-        ("robustness", robustness.add_arguments, "return under noise, failed sensors and pushes"),
+        ("robustness", deployment.add_robustness, "return under noise, failed sensors and pushes"),
         ("columns", logs.add_columns, "list the signals of a log, with a map to start from"),
         ("export", deployment.add_export, "export a policy as an ONNX file or a C header"),
         ("run", deployment.add_run, "run an exported policy in real time and record it"),

@@ -2,6 +2,7 @@
 
 import argparse
 import re
+import shlex
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -86,3 +87,36 @@ def _value(text: str) -> bool | int | float | str:
         except ValueError:
             continue
     return text
+
+
+def positions(words: Sequence[str]) -> dict[str, float | None]:
+    """
+    :param words: ``NAME`` or ``NAME:POSITION`` each, where names may contain colons
+    :return: positions by name; None without one
+    """
+    found: dict[str, float | None] = {}
+    for word in names(words):
+        name, _, position = word.rpartition(":")
+        try:
+            found[name or word] = float(position) if name else None
+        except ValueError:
+            found[word] = None
+    return found
+
+
+def with_options(message: str, options: Sequence[str], own: Sequence[str]) -> str:
+    """
+    :param options: names of options
+    :param own: names of values of ``--set``
+    :return: the message with arguments of Python as options: ``ignore=['x']`` as ``--ignore x``,
+        ``integrator='rk4'`` as ``--set integrator:rk4``
+    """
+
+    def option(found: re.Match[str]) -> str:
+        name, values = found[1], re.findall(r"'([^']*)'", found[2])
+        if name in own:
+            return f"--set {name}:{values[0]}"
+        return f"--{name} {' '.join(map(shlex.quote, values))}"
+
+    in_python = rf"\b({'|'.join((*options, *own))})=(\[[^\]]*\]|'[^']*')"
+    return re.sub(r"^lock: ", "--lock: ", re.sub(in_python, option, message))

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_hds.cli import measured, models
 from sb3_hds.cli.arguments import settings
 from sb3_hds.errors import ParameterError, did_you_mean
 
@@ -93,7 +94,7 @@ def add_twins(command: argparse.ArgumentParser) -> None:
         nargs="*",
         metavar="WORD",
         help="list only twins that mention all of these; or 'check NAME', 'check module:Name' for "
-        "one of your own: is it finite, consistent and a mechanical system?",
+        "one of your own, 'check robot.urdf': is it finite, consistent and a mechanical system?",
     )
     command.add_argument(
         "--set",
@@ -102,16 +103,18 @@ def add_twins(command: argparse.ArgumentParser) -> None:
         metavar="NAME:VALUE",
         help="parameters and options of the twin that is checked: mass:0.3 observe:q",
     )
+    models.add_options(command)
     command.set_defaults(run=run_twins)
 
 
 def run_twins(given: argparse.Namespace) -> int:
     """:return: 1 where a check failed, else 0"""
     if given.words[:1] != ["check"]:
-        if given.set:
-            raise ParameterError(
-                "--set changes the twin that is checked: twins check NAME --set ..."
-            )
+        for option in ("set", *models.OPTIONS):
+            if getattr(given, option):
+                raise ParameterError(
+                    f"--{option} changes the twin that is checked: twins check NAME --{option} ..."
+                )
         _list_twins(given.words)
         return 0
     if len(given.words) != 2:
@@ -119,10 +122,9 @@ def run_twins(given: argparse.Namespace) -> int:
             "Name one twin, as in 'sb3-hds twins check Pendulum' or 'sb3-hds twins check "
             f"my_module:MyTwin', got '{' '.join(given.words)}'."
         )
-    from sb3_hds.cli.measured import twin_called
     from sb3_hds.twins import check
 
-    found = check(twin_called(given.words[1], settings("--set", given.set)))
+    found = check(measured.twin_called(given.words[1], settings("--set", given.set), given))
     print(found)
     return 0 if found.ok else 1
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from sb3_hds.cli import measured
+from sb3_hds.cli import measured, models
 from sb3_hds.cli.arguments import names, settings
 from sb3_hds.cli.policies import algorithm
 from sb3_hds.errors import ParameterError
@@ -132,7 +132,7 @@ def _arguments_of(given: argparse.Namespace) -> list[str]:
     for option in ("twin", "model", "columns", "budget", "seed"):
         value = getattr(given, option)
         words += [] if value is None else [f"--{option}", str(value)]
-    for option in ("set", "actuators", "ignore", "calibrate", "effects"):
+    for option in ("set", *models.OPTIONS, "calibrate", "effects"):
         values = getattr(given, option)
         words += [f"--{option}", *values] if values else []
     return words

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from sb3_hds.cli import measured
+from sb3_hds.cli import measured, models
 from sb3_hds.errors import ParameterError
 
 
@@ -13,6 +13,13 @@ def add_columns(command: argparse.ArgumentParser) -> None:
     command.add_argument("file", metavar="FILE", help="a log of any format, or a folder with a bag")
     command.add_argument("--records", help="key of the rows in a nested file: data")
     command.add_argument("--skip", type=int, help="lines of a text file before its header")
+    command.add_argument(
+        "--model",
+        metavar="MODEL",
+        help="MJCF or URDF file of a robot, for whose joints the map is; with --lock and the like",
+    )
+    measured.add_set(command)
+    models.add_options(command)
     command.set_defaults(run=run_columns)
 
 
@@ -20,7 +27,11 @@ def run_columns(given: argparse.Namespace) -> None:
     """Print a map of columns as valid yml: ``sb3-hds columns log.csv > map.yml``."""
     from sb3_hds.data.overview import describe
 
-    print(describe(Path(given.file).expanduser(), given.records, given.skip))
+    if given.model is None:
+        models.refuse_options(given)
+    path = Path(given.file).expanduser()
+    suggested = None if given.model is None else models.map_for_model(given, str(path))
+    print(describe(path, given.records, given.skip, suggested))
 
 
 def add_audit(command: argparse.ArgumentParser) -> None:

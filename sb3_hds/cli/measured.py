@@ -7,16 +7,14 @@ from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from sb3_hds.cli.arguments import names, settings
+from sb3_hds.cli import models
+from sb3_hds.cli.arguments import settings
 from sb3_hds.errors import NoTwinError, ParameterError, TrajectoryError
 
 if TYPE_CHECKING:
     from sb3_hds.core import Trajectories, Twin
-    from sb3_hds.twins.mujoco import MechanismTwin
 
 _SUFFIXES = (".xml", ".mjcf", ".urdf")
-#: settings of ``--set`` that are arguments of ``from_mujoco``; all others are parameters
-_OPTIONS = ("dt", "integrator", "observe", "payload", "masses")
 _COLUMNS = """Say what the columns mean in a yml file, --columns map.yml:
 
     time: NAME                               # or {column: NAME, unit: ms}, or dt: SECONDS
@@ -29,7 +27,7 @@ _COLUMNS = """Say what the columns mean in a yml file, --columns map.yml:
 def add_arguments(command: argparse.ArgumentParser, *, twin_required: bool = True) -> None:
     """
     :param command: to which ``--twin`` or ``--model``, ``--data``, ``--columns``, ``--correct`` and
-        ``--set`` are added, and for models ``--actuators`` and ``--ignore``
+        ``--set`` are added, and the options of models
     :param twin_required: whether the command needs a twin
     """
     either = command.add_mutually_exclusive_group(required=twin_required)
@@ -49,26 +47,18 @@ def add_arguments(command: argparse.ArgumentParser, *, twin_required: bool = Tru
     command.add_argument(
         "--correct", action="store_true", help="cut and shift the data as their audit proposes"
     )
+    add_set(command)
+    models.add_options(command)
+
+
+def add_set(command: argparse.ArgumentParser) -> None:
+    """:param command: to which ``--set`` is added"""
     command.add_argument(
         "--set",
         nargs="*",
         default=[],
         metavar="NAME:VALUE",
         help="parameters and options of the twin: mass:0.3 observe:q driven:true",
-    )
-    command.add_argument(
-        "--actuators",
-        nargs="+",
-        metavar="KIND|NAME:VALUE",
-        help="actuators of a model without any, such as a URDF: torque (default), or servos whose "
-        "commands are targets: 'position kp:20 kv:1.5', 'velocity kv:5'",
-    )
-    command.add_argument(
-        "--ignore",
-        nargs="*",
-        default=[],
-        metavar="NAME",
-        help="features of a model to leave out: contacts, equality, fluid, limits, tendons",
     )
 
 
@@ -79,11 +69,11 @@ def twin_and_data(given: argparse.Namespace) -> "tuple[Twin, Trajectories]":
     :raises ParameterError: for options of a model without one
     """
     if given.model is not None:
-        return _model_and_data(given)
-    for option in ("actuators", "ignore"):
-        if getattr(given, option):
-            raise ParameterError(f"--{option} is about a model file: name one with --model.")
-    return twin_of(given), data_of(given, given.columns)
+        return models.model_and_data(given, partial(data_of, given))
+    models.refuse_options(given)
+    twin, load = twin_of(given), partial(data_of, given)
+    named = models.data_by_name(given, twin, load) if given.columns is None else None
+    return twin, load(given.columns) if named is None else named
 
 
 def data_of(given: argparse.Namespace, columns: Any) -> "Trajectories":
@@ -108,12 +98,21 @@ def twin_of(given: argparse.Namespace) -> "Twin":
     return twin_called(given.twin, settings("--set", given.set))
 
 
-def twin_called(name: str, values: Mapping[str, Any]) -> "Twin":
-    """The twin of a name, a ``module:Name`` of the current folder too, or a file."""
+def twin_called(
+    name: str, values: Mapping[str, Any], given: argparse.Namespace | None = None
+) -> "Twin":
+    """
+    The twin of a name, a ``module:Name`` of the current folder too, or a file.
+
+    :param given: the options of a model; None: none
+    :raises ParameterError: for options of a model without one
+    """
     from sb3_hds.twins import get
 
     if name.endswith(_SUFFIXES):
-        return _twin_of_model(name, values, {})
+        return models.twin_of_model(name, values, given)
+    if given is not None:
+        models.refuse_options(given)
     if name.endswith(".json"):
         return _twin_in(name).with_parameters(**values)
     if ":" in name and "" not in sys.path:
@@ -191,84 +190,3 @@ def write_json(path: str, plain: Mapping[str, Any]) -> None:
     from sb3_hds.core.trajectories.storage import write_bytes
 
     write_bytes(path, (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())
-
-
-def _twin_of_model(
-    path: str, given: Mapping[str, Any], model_options: Mapping[str, Any]
-) -> "MechanismTwin":
-    """
-    :param path: of an MJCF or URDF file
-    :param given: settings of ``--set``
-    :param model_options: ``actuators`` and ``ignore``
-    """
-    from sb3_hds.twins import from_mujoco
-
-    options = {name: given[name] for name in _OPTIONS if name in given}
-    values = {
-        name: float(value) if isinstance(value, int) else value
-        for name, value in given.items()
-        if name not in options
-    }
-    made: Any = from_mujoco(path, **options, **model_options)
-    return made.with_parameters(**values)
-
-
-def _model_and_data(given: argparse.Namespace) -> "tuple[MechanismTwin, Trajectories]":
-    """
-    The twin of ``--model``, at the interval of the data, and the data in the order of its signals.
-
-    :raises TrajectoryError: for signals of the twin that the log lacks by name
-    """
-    from sb3_hds.data.overview import channel_candidates
-
-    own = settings("--set", given.set)
-    make = partial(_twin_of_model, given.model, model_options=_model_options(given))
-    files = given.data[0] if len(given.data) == 1 else given.data
-    named = channel_candidates(files, given.columns)
-    if named is None:
-        data = data_of(given, given.columns)
-        return make({"dt": data.dt} | own), data
-    observed = [entry.name for entry in named.observed]
-    commanded = [entry.name for entry in named.commanded]
-    observe, found = _matched(make, own, observed, commanded)
-    suffix = " command" if commanded else ""
-    columns = named.chosen(
-        map(str, found.obs), (str(name).removesuffix(suffix) for name in found.actions)
-    )
-    data = data_of(given, columns)
-    for sentence in named.guessed:
-        print(sentence)
-    return make({"dt": data.dt} | observe | own), data
-
-
-def _matched(
-    make: Any, own: Mapping[str, Any], observed: list[str], commanded: list[str]
-) -> tuple[dict[str, Any], Any]:
-    """Match the log to the twin; without velocities in it, only positions are observed."""
-    from sb3_hds.twins.mujoco import match
-
-    columns = [*observed, *(f"{name} command" for name in commanded)]
-    twin = make(own)
-    found = match(twin, columns)
-    observe: dict[str, Any] = {}
-    lacking = [name for name, _ in found.missing]
-    if lacking and all(name.endswith("_velocity") for name in lacking) and "observe" not in own:
-        observe = {"observe": "q"}
-        found = match(make({**own, **observe}), columns)
-    try:
-        found.check()
-    except TrajectoryError as error:
-        raise TrajectoryError(
-            f"{error} In the map of columns, give each the name of its joint: obs: [{{column: "
-            f"NAME, name: {twin.channels[0].name}}}, ...], actions: [{{column: NAME, name: "
-            f"{twin.actuators[0].name if twin.actuators else 'NAME'}}}, ...]."
-        ) from None
-    return observe, found
-
-
-def _model_options(given: argparse.Namespace) -> dict[str, Any]:
-    found: dict[str, Any] = {"ignore": names(given.ignore)}
-    if given.actuators:
-        kind, *gains = given.actuators
-        found["actuators"] = {"kind": kind, **settings("--actuators", gains)}
-    return found

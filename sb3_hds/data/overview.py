@@ -5,7 +5,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -42,6 +42,7 @@ class _Column(NamedTuple):
     :param lowest: value; nan for texts
     :param highest: value; nan for texts
     :param step: median difference of two rows; nan if rows decrease
+    :param rising: whether each row is above the one before it
     :param example: first value
     """
 
@@ -51,6 +52,7 @@ class _Column(NamedTuple):
     lowest: float
     highest: float
     step: float
+    rising: bool
     example: str
 
     @property
@@ -59,7 +61,12 @@ class _Column(NamedTuple):
         return self.highest > self.lowest and self.rows > 1
 
 
-def describe(path: Path, records: str | None = None, skip: int | None = None) -> str:
+def describe(
+    path: Path,
+    records: str | None = None,
+    skip: int | None = None,
+    suggested: str | None = None,
+) -> str:
     """
     List the columns of a file, and guess their meaning.
 
@@ -68,17 +75,19 @@ def describe(path: Path, records: str | None = None, skip: int | None = None) ->
     :param path: of a log
     :param records: path to the rows in a nested file
     :param skip: number of lines before the names of a text file
+    :param suggested: a map, instead of the guess
     :raises TrajectoryError: if the file cannot be read
     """
     log = read_log(path, Columns(records=records, skip=skip))
     columns = _columns_in(log)
     lines = [*_column_table(path, log, columns), ""]
-    if log.columns is not None and log.columns.obs is not None:
+    if suggested is None and log.columns is not None and log.columns.obs is not None:
         return "\n".join([*lines, "# The file declares its columns and needs no map.", ""])
-    lines += ["# A map to start from. Every line is a guess: check it."]
+    hint = "" if suggested else " With --model FILE it is one for a robot's joints."
+    lines += [f"# A map to start from. Every line is a guess: check it.{hint}"]
     lines += [f"records: {records}"] if records else []
     lines += [f"skip: {skip}"] if skip else []
-    return "\n".join([*lines, *_suggested_map(log, columns), ""])
+    return "\n".join([*lines, *([suggested] if suggested else _guessed_map(log, columns)), ""])
 
 
 def _columns_in(log: Log) -> list[_Column]:
@@ -90,6 +99,7 @@ def _column(name: str, log: Log) -> _Column:
     values = np.concatenate([part.ravel() for part in parts])
     rows = sum(part.size for part in parts if part.ndim)
     lowest = highest = step = np.nan
+    rising = False
     example = str(values[0])[:20] if len(values) else ""
     if values.dtype.kind in "iufb" and len(values):
         finite = values[np.isfinite(values)].astype(float)
@@ -97,8 +107,8 @@ def _column(name: str, log: Log) -> _Column:
         if len(finite):
             lowest, highest = float(finite.min()), float(finite.max())
         if len(steps) and np.mean(steps < 0.0) < 0.02:
-            step = float(np.median(steps))
-    return _Column(name, rows, str(values.dtype), lowest, highest, step, example)
+            step, rising = float(np.median(steps)), bool(np.all(steps > 0.0))
+    return _Column(name, rows, str(values.dtype), lowest, highest, step, rising, example)
 
 
 def _column_table(path: Path, log: Log, columns: Sequence[_Column]) -> list[str]:
@@ -121,7 +131,7 @@ def _column_table(path: Path, log: Log, columns: Sequence[_Column]) -> list[str]
     return [line.rstrip() for line in lines]
 
 
-def _suggested_map(log: Log, columns: Sequence[_Column]) -> list[str]:
+def _guessed_map(log: Log, columns: Sequence[_Column]) -> list[str]:
     own = log.columns or Columns()
     signals = [c for c in columns if not np.isnan(c.lowest)]
     time = None if own.time else _guessed_time(signals)
@@ -145,12 +155,18 @@ def _suggested_map(log: Log, columns: Sequence[_Column]) -> list[str]:
 
 
 def _guessed_time(columns: Sequence[_Column]) -> _Column | None:
-    """An increasing column whose name suggests a time, or else one that increases steadily."""
-    rising = [c for c in columns if c.step > 0.0]
-    called = [c for c in rising if _has_word(c, _TIME)]
-    others = [c for c in rising if c.varies and not _has_word(c, f"{_INDEX} {_OBSERVED} {_ACTION}")]
-    steady = [c for c in others if abs((c.highest - c.lowest) / (c.step * (c.rows - 1)) - 1) < 0.01]
-    return next(iter([*called, *steady]), None)
+    """
+    An increasing column whose name suggests a time, or else one that increases steadily. The first
+    column may do so less evenly.
+    """
+    increasing = [c for c in columns if c.step > 0.0]
+    called = [c for c in increasing if _has_word(c, _TIME)]
+    words = f"{_INDEX} {_OBSERVED} {_ACTION}"
+    others = [c for c in increasing if c.varies and not _has_word(c, words)]
+    uneven = {c.name: (c.highest - c.lowest) / (c.step * (c.rows - 1)) - 1.0 for c in others}
+    steady = [c for c in others if abs(uneven[c.name]) < 0.01]
+    first = [c for c in others if c is columns[0] and c.rising and -0.1 < uneven[c.name] < 0.5]
+    return next(iter([*called, *first, *steady]), None)
 
 
 def _time_line(log: Log, time: _Column | None) -> str:
@@ -205,8 +221,10 @@ def _words(name: str) -> list[str]:
     return [word for word in re.split(r"[\W\d_]+", split.lower()) if word]
 
 
-def _inline_yaml(entry: Mapping[str, str]) -> str:
-    text = yaml.safe_dump(dict(entry), default_flow_style=True, allow_unicode=True, width=10_000)
+def _inline_yaml(entry: Any) -> str:
+    text = yaml.safe_dump(
+        entry, default_flow_style=True, allow_unicode=True, width=10_000, sort_keys=False
+    )
     return text.strip()
 
 
@@ -239,6 +257,56 @@ class ChannelCandidates:
             obs=tuple(known[name] for name in obs),
             actions=tuple(commands[name] for name in actions),
         )
+
+
+class Suggestion(NamedTuple):
+    """
+    A line of a map of columns.
+
+    :param name: of the channel
+    :param entry: name of its entry, as in :class:`ChannelCandidates`; empty if unknown
+    :param comment: on the line; empty without any
+    """
+
+    name: str
+    entry: str
+    comment: str = ""
+
+
+def suggested_map(
+    known: ChannelCandidates, obs: Iterable[Suggestion], actions: Iterable[Suggestion]
+) -> str:
+    """
+    :param obs: a line for each channel of a twin, in its order
+    :param actions: a line for each actuator
+    :return: a map of columns as yml, in which ``NAME`` stands for columns that are not known
+    """
+    entries = {entry.name: entry for entry in (*known.commanded, *known.observed)}
+    lines = [_line_of_time(known.rest)]
+    for key, suggestions in (("obs", list(obs)), ("actions", list(actions))):
+        lines.append(f"{key}:" + ("" if suggestions else " []"))
+        for name, entry, comment in suggestions:
+            fields = _fields_of(entries.get(entry, Entry(name, "NAME"))) | {"name": name}
+            lines.append(f"  - {_inline_yaml(fields)}" + (f"  # {comment}" if comment else ""))
+    return "\n".join(lines)
+
+
+def _line_of_time(rest: Columns) -> str:
+    if rest.time is None:
+        known = "SECONDS  # or time: NAME" if rest.dt is None else f"{rest.dt:g}"
+        return f"dt: {known}"
+    fields = [_fields_of(entry) for entry in rest.time]
+    return f"time: {_inline_yaml(fields[0] if len(fields) == 1 else fields)}"
+
+
+def _fields_of(entry: Entry) -> dict[str, Any]:
+    """The fields of an entry that differ from their defaults, without its name."""
+    if entry.column is None:
+        return {"constant": entry.offset}
+    fields = entry._asdict() | {"unit": entry.unit or None}
+    defaults = Entry._field_defaults
+    given = {key: fields[key] for key in ("column", "unit", "scale", "offset", "angle")}
+    return {key: x for key, x in given.items() if key == "column" or x != defaults[key]}
 
 
 def channel_candidates(

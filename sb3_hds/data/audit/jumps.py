@@ -50,7 +50,9 @@ class Outliers(Finding):
             f"between {self.low:.4g} and {self.high:.4g} ({self.where})."
         )
 
-    remedy = "Look at sensor and cable. audit.corrected(data) cuts these samples out."
+    remedy = (
+        "Look at sensor and cable. audit.corrected(data), or --correct, cuts these samples out."
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,8 +93,8 @@ class ReinitialisedState(Finding):
         )
 
     remedy = (
-        "The state was reset within the recording: audit.corrected(data) cuts there. Or name the "
-        "column that counts episodes when loading."
+        "The state was reset within the recording: audit.corrected(data), or --correct, cuts "
+        "there. Or name the column that counts episodes when loading."
     )
 
 

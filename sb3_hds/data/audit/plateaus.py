@@ -16,11 +16,13 @@ from sb3_hds.data.audit.finding import Finding, Place
 from sb3_hds.data.audit.segments import Segment, joined, steps_of
 from sb3_hds.data.resampling.values import runs
 from sb3_hds.data.wording import percent
+from sb3_hds.errors import first_names
 
 _STEPS = 8.0  # smallest steps per sample: slower motion repeats values because of quantisation
 _ROUGH = 3.0  # typical changes of the step: slower motion repeats values by chance
 _REPEATED = 0.01  # of the moving samples
 _FEWEST_REPEATED = 3
+_FEW_CHANNELS = 3
 _LONGEST_REPEAT = 5  # samples
 _STEADY = (0.5, 1.6)  # of the speed: range of the steps around a repeated value
 _STUCK = 20  # samples
@@ -31,18 +33,32 @@ _MARGIN = 0.002  # of a joint's range: stops are soft, and sensors noisy
 
 @dataclasses.dataclass(frozen=True)
 class RepeatedSamples(Finding):
-    """:param share: of the samples of a moving channel that repeat the one before"""
+    """
+    :param share: of the samples of a moving channel that repeat the one before; of several
+        channels, the largest
+    :param others: names of further channels that do so
+    :param at_once: whether all channels do so in the same samples
+    """
 
     share: float
+    others: tuple[str, ...] = ()
+    at_once: bool = False
 
     @property
     def sentence(self) -> str:
-        return (
-            f"'{self.channel}' repeats its last value while it moves, in {percent(self.share)} of "
-            f"its moving samples ({self.where})."
-        )
+        seen = f"{percent(self.share)} of the moving samples ({self.where})."
+        if self.at_once:
+            n = 1 + len(self.others)
+            return f"All {n} channels repeat their last values at once, in {seen}"
+        if self.others:
+            names = first_names([self.channel, *self.others])
+            return f"{names} repeat their last values while they move, in up to {seen}"
+        return f"'{self.channel}' repeats its last value while it moves, in {seen}"
 
-    remedy = "The sensor is read more often than it measures: log at its rate, or resample to it."
+    remedy = (
+        "The sensor is read more often than it measures, or messages are logged twice: log at its "
+        "rate, resample to it, or leave the repeated rows out."
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,9 +150,13 @@ def repeated_samples(
     ]
     places = [set(finding.places) for finding in found]
     together = set.intersection(*places) if len(found) == len(names) > 1 else set()
-    if len(together) > 0.8 * max(map(len, places), default=0):
-        return [RepeatedSamples(", ".join(names), found[0].places, found[0].share)]
-    return found
+    at_once = len(together) > 0.8 * max(map(len, places), default=0)
+    if not at_once and len(found) <= _FEW_CHANNELS:
+        return found
+    first, *others = found
+    share = max(finding.share for finding in found)
+    others = tuple(finding.channel for finding in others)
+    return [dataclasses.replace(first, share=share, others=others, at_once=at_once)]
 
 
 def _repeats(segments: Sequence[Segment], j: int, resolution: float) -> tuple[list[Place], float]:

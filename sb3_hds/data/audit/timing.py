@@ -34,8 +34,9 @@ class UnevenSampling(Finding):
         )
 
     remedy = (
-        "The rows were resampled; compare the interpolation error (print data.report) with the "
-        "noise. In future recordings, trigger command and measurement by one clock."
+        "The rows were resampled; compare the interpolation error, which the report of the "
+        "reading states, with the noise. In future recordings, trigger command and measurement by "
+        "one clock."
     )
 
 

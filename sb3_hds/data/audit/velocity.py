@@ -66,8 +66,8 @@ class VelocityShift(Finding):
         )
 
     remedy = (
-        "Shift it: audit.corrected(data). A filter in the drive is the usual cause; uncorrected, "
-        "it passes for a delay or for friction."
+        "Shift it: audit.corrected(data), or --correct. A filter in the drive is the usual cause; "
+        "uncorrected, it passes for a delay or for friction."
     )
 
 
@@ -83,8 +83,8 @@ class BackwardDifference(VelocityShift):
         )
 
     remedy = (
-        "Shift it: audit.corrected(data). This is not a sensor delay. Do not shift it if the twin "
-        "computes its velocity in the same way."
+        "Shift it: audit.corrected(data), or --correct. This is not a sensor delay. Do not shift "
+        "it if the twin computes its velocity in the same way."
     )
 
 

@@ -7,6 +7,8 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple, get_args
 
+import numpy as np
+
 from sb3_hds.core.declarations import Actuator, Channel
 from sb3_hds.core.trajectories.episodes import SAME_RATE
 from sb3_hds.data.conversion import same_quantity
@@ -15,6 +17,7 @@ from sb3_hds.data.resampling.rows import Rows
 from sb3_hds.data.wording import counted
 
 _LISTED = 20
+_FEW_CHANNELS = 4
 _DRIFT = 1e-4  # relative change of a rate that is reported
 
 
@@ -145,14 +148,12 @@ class Reading:
         filled = [r for r in self.recordings if r.missing]
         found = []
         if uneven:
-            errors = [max(values) for values in zip(*(r.error for r in uneven), strict=True)]
-            pairs = ", ".join(f"{n} {e:.2g}" for n, e in zip(self.obs, errors, strict=True))
             found.append(
                 f"{_subject_were(uneven)} resampled to dt = {self.dt:g} s: rows were "
                 f"{_ms(min(r.intervals[0] for r in uneven))} to "
                 f"{_ms(max(r.intervals[2] for r in uneven))} apart, samples are up to "
                 f"{_ms(max(r.moved for r in uneven))} from the closest row; interpolated back, "
-                f"the rms differences from the rows are {pairs}"
+                f"the rms differences from the rows are {self._errors(uneven)}"
             )
         if filled:
             n = sum(rows for r in filled for _, rows in r.missing)
@@ -174,6 +175,20 @@ class Reading:
                 f"{_subject_were(gaps)} cut at {counted(n, 'gap')} of up to {longest:.3g} s{short}"
             )
         return ". ".join(found) + "." if found else "Nothing was changed."
+
+    def _errors(self, uneven: list[Sampling]) -> str:
+        """Errors of interpolation: of a few channels all, of many the largest one."""
+        errors = [max(values) for values in zip(*(r.error for r in uneven), strict=True)]
+        named = [f"{name} {error:.2g}" for name, error in zip(self.obs, errors, strict=True)]
+        if len(named) <= _FEW_CHANNELS or not self.parts:
+            return ", ".join(named)
+        deviations = np.max([np.std(part.rows.obs, axis=0) for part in self.parts], axis=0)
+        shares = np.array(errors) / np.where(deviations > 0.0, deviations, np.inf)
+        worst = int(np.argmax(shares))
+        return (
+            f"at most {100.0 * shares[worst]:.2g} % of a channel's standard deviation "
+            f"({named[worst]})"
+        )
 
     def misfit(self, channels: Sequence[Channel], actuators: Sequence[Actuator] = ()) -> str:
         """

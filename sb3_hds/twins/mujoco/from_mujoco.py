@@ -6,10 +6,11 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from sb3_hds.errors import ModelFileError, ParameterError, did_you_mean
+from sb3_hds.errors import ParameterError, did_you_mean
 from sb3_hds.twins.mujoco.engine.contact_twin import ContactTwin
 from sb3_hds.twins.mujoco.files.load import load
-from sb3_hds.twins.mujoco.files.reading import integrator_of, n_actuators, read
+from sb3_hds.twins.mujoco.files.locking import Lock, Locks, locked_positions
+from sb3_hds.twins.mujoco.files.reading import integrator_of, read
 from sb3_hds.twins.mujoco.files.refusals import refuse
 from sb3_hds.twins.mujoco.files.shapes import shapes_of
 from sb3_hds.twins.mujoco.identifiability import unidentifiable
@@ -32,6 +33,7 @@ def from_mujoco(
     reward: Reward | None = None,
     terminated: Terminated | None = None,
     ignore: Collection[str] = (),
+    lock: Lock = (),
 ) -> MechanismTwin | ContactTwin:
     """
     A twin of a model that MuJoCo can load: in JAX, without contacts, or on MuJoCo's own engine.
@@ -60,17 +62,21 @@ def from_mujoco(
     :param terminated: termination of a task: ``terminated(state, params)``
     :param ignore: features of the model that the twin omits: ``"contacts"`` if there are none in
         the data, ``"equality"``, ``"fluid"``, ``"limits"``, ``"tendons"``
+    :param lock: joints that stand still, such as a gripper's: names or patterns, ``"*_finger_*"``,
+        or a mapping of them to positions [rad] or [m]; default: the reference position. What they
+        carry keeps its inertia and becomes rigid. Joints that follow a locked one are locked, too;
+        actuators that drive only locked joints are left out
     :raises ModelFileError: for a file that cannot be read, or unsupported features of the model
-    :raises ParameterError: for invalid actuators, integrator or payload
+    :raises ParameterError: for invalid actuators, integrator, payload or locked joints
     """
     if engine not in ("auto", "smooth", "mujoco"):
         raise ParameterError(f"engine must be 'smooth', 'mujoco' or 'auto', got {engine!r}.")
     loaded = load(model_or_path_or_env)
     if engine == "mujoco":
-        if actuators is not None or integrator is not None or payload is not None or masses:
+        if actuators is not None or integrator is not None or payload is not None or masses or lock:
             raise ParameterError(
-                "actuators, integrator, payload and masses are for engine='smooth'. Write them "
-                "into the model; on MuJoCo's engine, masses are parameters anyway."
+                "actuators, integrator, payload, masses and lock are for engine='smooth'. Write "
+                "them into the model; on MuJoCo's engine, masses are parameters anyway."
             )
         dt = loaded.dt if dt is None else dt
         task: Any = {"reward": reward, "terminated": terminated}
@@ -78,19 +84,15 @@ def from_mujoco(
     if integrator is None:
         integrator = "implicitfast" if loaded.urdf else integrator_of(loaded.model)
     ignore = (ignore,) if isinstance(ignore, str) else tuple(ignore)
-    refuse(loaded.model, integrator, ignore)
-    if loaded.mimics and not loaded.model.neq and "equality" not in ignore:
-        raise ModelFileError(
-            f"Joints mimic others ({', '.join(loaded.mimics)}), which the twin does not simulate: "
-            "they would move independently. To accept that, pass ignore=['equality']."
-        )
-    mechanism = read(loaded.model, integrator=integrator)
+    locks = Locks.of(loaded.model, locked_positions(loaded.model, lock, loaded.mimics))
+    refuse(loaded.model, integrator, ignore, locks, loaded.mimics)
+    mechanism = read(loaded.model, integrator=integrator, locks=locks)
     changes: dict[str, Any] = {}
     if loaded.drawn is not None:
         changes["shapes"] = shapes_of(loaded.drawn, mechanism.places)
     if "limits" in ignore:
         changes["links"] = tuple(dataclasses.replace(x, limit=None) for x in mechanism.links)
-    if actuators is None and not n_actuators(loaded.model):
+    if actuators is None and not mechanism.drives:
         actuators = "torque"
     if actuators is not None:
         changes["drives"] = tuple(_drives(mechanism, actuators))

@@ -199,6 +199,8 @@ class Mechanism:
     :param implicit_damping: whether ``euler`` takes damping at the end of its step
     :param start: initial position of an episode
     :param shapes: for drawings
+    :param locked: joints of the model that it lacks, because they stand still: the numbers of
+        each in a position of the model
     """
 
     name: str
@@ -211,6 +213,7 @@ class Mechanism:
     implicit_damping: bool
     start: tuple[float, ...]
     shapes: tuple[Shape, ...] = ()
+    locked: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
     @property
     def n_q(self) -> int:

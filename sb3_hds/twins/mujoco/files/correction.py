@@ -40,7 +40,8 @@ class Correction:
     @classmethod
     def of(cls, twin: Twin, plant: MechanismTwin) -> "Correction":
         values = {name: float(twin.values.get(name, plant.values[name])) for name in plant.values}
-        found = cls(plant, values, [])
+        still = [f"{name}, which the twin has locked" for name, _ in plant.mechanism.locked]
+        found = cls(plant, values, [], left_out=still)
         for layer in layers_of(twin):
             if layer is plant:
                 continue

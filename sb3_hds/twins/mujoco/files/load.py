@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_hds.errors import ModelFileError
+from sb3_hds.twins.mujoco.files.locking import Coupling
 from sb3_hds.twins.mujoco.files.shapes import visuals_of
 from sb3_hds.twins.mujoco.library import mujoco
 
@@ -15,14 +16,15 @@ class Loaded(NamedTuple):
     :param model: an ``MjModel``
     :param dt: control interval of an environment [s]
     :param urdf: whether it comes from a URDF, which has neither drives nor an integrator
-    :param mimics: joints of a URDF that follow another, which older versions of MuJoCo leave free
+    :param mimics: joints of a URDF that follow another, where an older version of MuJoCo leaves
+        them free
     :param drawn: a compiled model with the visual meshes; None without any
     """
 
     model: Any
     dt: float | None = None
     urdf: bool = False
-    mimics: tuple[str, ...] = ()
+    mimics: tuple[Coupling, ...] = ()
     drawn: Any = None
 
 
@@ -51,8 +53,8 @@ def load(source: Any) -> Loaded:
 
 def _from_text_or_file(source: str | os.PathLike[str]) -> Loaded:
     text, urdf, parsed, where = _parser_of(source)
-    mimics = tuple(_mimics(text)) if urdf else ()
     model = _compiled(parsed, where)[0]
+    mimics = tuple(_mimics(text)) if urdf and not model.neq else ()
     if not urdf:
         return Loaded(model, drawn=model)
     folder = Path.cwd() if text == str(source).lstrip() else Path(source).parent
@@ -133,14 +135,20 @@ def _compiled(parsed: Callable[[], Any], where: str) -> tuple[Any, Any]:
         raise ModelFileError(f"MuJoCo refuses {where}: {_first_line(error)}.{hint}") from None
 
 
-def _mimics(text: str) -> list[str]:
+def _mimics(text: str) -> list[Coupling]:
     from xml.etree import ElementTree
 
     try:
         joints = ElementTree.fromstring(text).iter("joint")
     except ElementTree.ParseError:
         return []
-    return [joint.get("name", "") for joint in joints if joint.find("mimic") is not None]
+    found = []
+    for joint in joints:
+        mimic = joint.find("mimic")
+        if mimic is not None:
+            powers = float(mimic.get("offset", "0")), float(mimic.get("multiplier", "1"))
+            found.append(Coupling(joint.get("name", ""), mimic.get("joint", ""), powers))
+    return found
 
 
 def _first_line(error: Exception) -> str:

@@ -18,6 +18,7 @@ from sb3_hds.twins.mujoco.files.correction import (
     in_body_frame,
 )
 from sb3_hds.twins.mujoco.files.load import spec_of
+from sb3_hds.twins.mujoco.files.locking import Locks
 from sb3_hds.twins.mujoco.files.reading import read
 from sb3_hds.twins.mujoco.library import mujoco
 from sb3_hds.twins.mujoco.mechanism import Drive, Link, Mechanism
@@ -30,26 +31,30 @@ _IMPEDANCE = 0.99
 def mjcf_of(correction: Correction, source: Any, target: Path) -> str:
     mj, mechanism = mujoco(), correction.mechanism
     spec, model, _ = spec_of(source)
-    file = read(model, integrator=mechanism.integrator)
+    locks = Locks.named(model, mechanism.locked)
+    file = read(model, integrator=mechanism.integrator, locks=locks)
     _check_same(mechanism, file)
     spec.option.timestep = correction.plant.dt / correction.plant.substeps
     spec.option.integrator = getattr(mj.mjtIntegrator, f"mjINT_{mechanism.integrator.upper()}")
-    by_id = {joint.id: joint for joint in spec.joints}
-    for index, link in enumerate(mechanism.links):
-        _write_joint(correction, by_id[index], link, float(spec.option.timestep))
+    moving = [joint for joint in spec.joints if joint.id not in locks.positions]
+    joints = sorted(moving, key=lambda joint: joint.id)
+    for joint, link in zip(joints, mechanism.links, strict=True):
+        _write_joint(correction, joint, link, float(spec.option.timestep))
     tilted = [n for n in correction.values if n.startswith("tilt_") and correction.difference(n)]
     if tilted:
         spec.option.gravity = np.array(gravity_of(mechanism, correction.values), float)
         for name in tilted:
             correction.record_change(name)
-    _write_bodies(correction, spec, model)
+    _write_bodies(correction, spec, model, locks)
     drives = [_corrected(correction, drive) for drive in mechanism.drives]
     if [d.name for d in file.drives] == [d.name for d in mechanism.drives]:
-        actuators = sorted(spec.actuators, key=lambda actuator: actuator.id)
+        acting = [a for a in spec.actuators if a.id not in locks.actuators]
+        actuators = sorted(acting, key=lambda actuator: actuator.id)
     else:
         for actuator in list(spec.actuators):
-            spec.delete(actuator)
-        actuators = [_added(spec, by_id[d.link], d) for d in mechanism.drives]
+            if actuator.id not in locks.actuators:
+                spec.delete(actuator)
+        actuators = [_added(spec, joints[d.link], d) for d in mechanism.drives]
         correction.changed += [f"actuator {drive.name}" for drive in mechanism.drives]
     for actuator, drive, before in zip(actuators, drives, mechanism.drives, strict=True):
         # A damping ratio depends on the masses: write the damping that it meant in the source.
@@ -216,19 +221,23 @@ _OF_ACTUATORS = {
 }
 
 
-def _write_bodies(correction: Correction, spec: Any, model: Any) -> None:
+def _write_bodies(correction: Correction, spec: Any, model: Any, locks: Locks) -> None:
     """Bodies that are rigidly attached to one joint are one body of the twin: change the first."""
     wanted = changed_bodies(correction)
     if not wanted:
         return
     mj, mechanism = mujoco(), correction.mechanism
     by_id = {body.id: body for body in spec.bodies}
+    moving = [j for j in range(model.njnt) if j not in locks.positions]
     link_of: dict[int, int] = {0: -1}
     for b in range(1, model.nbody):
-        n = int(model.body_jntnum[b])
-        last = int(model.body_jntadr[b]) + n - 1
-        link_of[b] = last if n else link_of[int(model.body_parentid[b])]
+        begin = int(model.body_jntadr[b])
+        own = [
+            moving.index(j) for j in range(begin, begin + int(model.body_jntnum[b])) if j in moving
+        ]
+        link_of[b] = own[-1] if own else link_of[int(model.body_parentid[b])]
     data = mj.MjData(model)
+    data.qpos[:] = locks.qpos(model)
     mj.mj_kinematics(model, data)
     for i, new in wanted.items():
         link = mechanism.links[i]

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from sb3_hds.errors import ParameterError
+from sb3_hds.twins.mujoco.files.locking import Locks, joint_name
 from sb3_hds.twins.mujoco.library import mujoco
 from sb3_hds.twins.mujoco.mechanism import (
     BALL,
@@ -28,15 +29,17 @@ _ROUNDING = 1e-10
 _OF_INERTIA = 1e-13
 
 
-def read(model: Any, *, integrator: str | None = None) -> Mechanism:
+def read(model: Any, *, integrator: str | None = None, locks: Locks | None = None) -> Mechanism:
     """
     :param model: compiled, without unsupported features
     :param integrator: instead of the model's: ``"euler"``, ``"implicitfast"`` or ``"rk4"``
+    :param locks: joints that the mechanism does not have: what they carry is rigid
     :raises ParameterError: for another integrator
     """
     mj = mujoco()
+    locks = Locks.of(model, {}) if locks is None else locks
     data = mj.MjData(model)
-    data.qpos[:] = model.qpos0
+    data.qpos[:] = locks.qpos(model)
     mj.mj_kinematics(model, data)
     mj.mj_comPos(model, data)
     off = _disabled(model)
@@ -44,9 +47,12 @@ def read(model: Any, *, integrator: str | None = None) -> Mechanism:
     links: list[dict[str, Any]] = []
     carried: list[list[int]] = []
     link_of_body, link_of_joint = {0: -1}, {}
+    q = v = 0
     for b in range(1, model.nbody):
         last = link_of_body[int(model.body_parentid[b])]
         for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
+            if j in locks.positions:
+                continue
             kind = _KINDS[int(model.jnt_type[j])]
             turned = kind in (BALL, FREE)
             frame = data.xmat[b].reshape(3, 3) if turned else _with_z_along(data.xaxis[j])
@@ -54,24 +60,36 @@ def read(model: Any, *, integrator: str | None = None) -> Mechanism:
             outer, at = frames[last]
             frames[len(links)] = (frame, anchor)
             turn, way = outer.T @ frame, outer.T @ (anchor - at)
-            links.append(_link(model, j, kind, last, turn, way, off))
+            links.append(_link(model, j, kind, last, turn, way, off) | {"q": q, "v": v})
+            q, v = q + SIZES[kind][0], v + SIZES[kind][1]
             carried.append([])
             last = link_of_joint[j] = len(links) - 1
         link_of_body[b] = last
         if last >= 0:
             carried[last].append(b)
     bodies = [_body(model, data, own, *frames[i]) for i, own in enumerate(carried)]
+    start = model.key_qpos[0] if model.nkey else model.qpos0
     return Mechanism(
         name=_name_of(model),
         links=tuple(Link(**link, body=body) for link, body in zip(links, bodies, strict=True)),
-        drives=tuple(_drives(model, link_of_joint, off)),
+        drives=tuple(_drives(model, link_of_joint, off, locks)),
         places=tuple(_places(model, data, link_of_body, frames)),
         gravity=(0.0, 0.0, 0.0) if "GRAVITY" in off else _numbers(model.opt.gravity),
         timestep=float(model.opt.timestep),
         integrator=_integrator(model, integrator),
         implicit_damping="EULERDAMP" not in off,
-        start=_numbers(model.key_qpos[0] if model.nkey else model.qpos0),
+        start=_numbers(
+            np.concatenate([start[:0], *(start[_in_qpos(model, j)] for j in link_of_joint)])
+        ),
+        locked=tuple(
+            (joint_name(model, j), _numbers(locks.positions[j])) for j in sorted(locks.positions)
+        ),
     )
+
+
+def _in_qpos(model: Any, j: int) -> slice:
+    at = int(model.jnt_qposadr[j])
+    return slice(at, at + SIZES[_KINDS[int(model.jnt_type[j])]][0])
 
 
 def integrator_of(model: Any) -> str:
@@ -108,14 +126,12 @@ def _link(
     spring = _with_powers(model, "jnt_stiffness")[j]
     pushed = single and bool(model.jnt_actfrclimited[j])
     return {
-        "joint": model.joint(j).name or f"joint{j}",
+        "joint": joint_name(model, j),
         "kind": kind,
         "parent": parent,
         "rotation": _rows(np.eye(3) if free else _rounded(turn)),
         "origin": _numbers(np.zeros(3) if free else _rounded(way)),
         "reference": float(model.qpos0[q]) if single else 0.0,
-        "q": q,
-        "v": v,
         "stiffness": () if "SPRING" in off else _trimmed(spring),
         "rest": _numbers(model.qpos_spring[q : q + n_q]),
         "damping": tuple(() if "DAMPER" in off else _trimmed(row) for row in dampings),
@@ -173,10 +189,12 @@ def _body(
     )
 
 
-def _drives(model: Any, link_of_joint: dict[int, int], off: set[str]) -> list[Drive]:
+def _drives(model: Any, link_of_joint: dict[int, int], off: set[str], locks: Locks) -> list[Drive]:
     mj = mujoco()
     found = []
     for i in range(n_actuators(model)):
+        if i in locks.actuators:
+            continue
         joint = int(model.actuator_trnid[i, 0])
         width = {FREE: 6, BALL: 3}.get(_KINDS[int(model.jnt_type[joint])], 1)
         kind = mj.mjtGain(model.actuator_gaintype[i]).name.removeprefix("mjGAIN_").lower()
