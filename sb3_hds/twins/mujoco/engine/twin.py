@@ -63,6 +63,8 @@ class EngineTwin(QuaternionTwin):
     :meth:`source`.
     """
 
+    differentiability = "differences"
+
     @abc.abstractmethod
     def source(self) -> Source:
         """:return: where the nominal model comes from"""
