@@ -311,9 +311,7 @@ class ModelFreeAlgorithm(OffPolicyTensorAlgorithm):
         return rate, self._rate("qf_learning_rate", schedule_of(self.qf_learning_rate))
 
     def _rate(self, name: str, schedule: Schedule) -> float:
-        """
-        :raises ValueError: unless it is a finite number of at least 0
-        """
+        """:raises ValueError: unless it is a finite number of at least 0"""
         # The last collection may exceed ``total_timesteps``.
         remaining = max(0.0, self._current_progress_remaining)
         rate = float(schedule(remaining))

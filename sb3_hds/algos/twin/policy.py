@@ -257,17 +257,13 @@ class TwinPolicyConfig(PolicyConfig):
     use_sde: bool = False
 
     def __post_init__(self) -> None:
-        """
-        :raises ValueError: for arguments out of range
-        """
+        """:raises ValueError: for arguments out of range"""
         if not self.max_grad_norm > 0.0:
             raise ValueError(f"max_grad_norm must be above 0, got {self.max_grad_norm!r}.")
 
 
 class TwinPolicy(TensorPolicy):
-    """
-    A policy network and a value network, with their own normalisation of inputs.
-    """
+    """A policy network and a value network, with their own normalisation of inputs."""
 
     @takes(TwinPolicyConfig)
     def __init__(self, config: TwinPolicyConfig) -> None:

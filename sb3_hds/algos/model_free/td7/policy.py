@@ -172,9 +172,7 @@ class TD7PolicyConfig(PolicyConfig):
     use_sde: bool = False
 
     def __post_init__(self) -> None:
-        """
-        :raises ValueError: for arguments out of range
-        """
+        """:raises ValueError: for arguments out of range"""
         check_count("n_critics", self.n_critics)
         check_count("embedding_size", self.embedding_size)
 
