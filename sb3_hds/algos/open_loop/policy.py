@@ -47,7 +47,6 @@ class OscillatorPolicy(TensorPolicy):
     :param action_space: a bounded Box of any shape
     :param lr_schedule: passed by SB3; not used
     :param robot: time step and joints, see :class:`~sb3_hds.algos.open_loop.robot.Robot`
-    :param use_sde: passed by SB3; not used
     """
 
     def __init__(
@@ -56,7 +55,6 @@ class OscillatorPolicy(TensorPolicy):
         action_space: spaces.Box,
         lr_schedule: Schedule,
         robot: Robot | Mapping[str, Any] | None = None,
-        use_sde: bool = False,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=False)
         n = int(np.prod(action_space.shape))
