@@ -262,6 +262,4 @@ def _q_values(config: UpdateConfig, encoder: Any, critic: Any, obs: Any, actions
     return q_values(config, critic, obs, actions, *embed(config, encoder, obs, actions))
 
 
-@partial(jax.jit, static_argnums=0)
-def _act(config: UpdateConfig, encoder: Any, actor: Any, obs: Any) -> jax.Array:
-    return act(config, encoder, actor, obs)
+_act = jax.jit(act, static_argnums=0)
