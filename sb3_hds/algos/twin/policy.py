@@ -280,12 +280,7 @@ class TwinPolicy(TensorPolicy):
         self.build(jax.random.key(0, impl=GENERATOR), jax.devices()[0])
 
     def build(self, key: jax.Array, device: Any) -> None:
-        """
-        Initialise the networks.
-
-        :param key: of the generator ``unsafe_rbg``
-        :param device: of JAX
-        """
+        """Initialise the networks by a key of the generator ``unsafe_rbg``."""
         n_obs = spaces.flatdim(self.observation_space)
         networks, progress = fresh_networks(
             self.actor_network, self.value_network, n_obs, self.max_grad_norm, key

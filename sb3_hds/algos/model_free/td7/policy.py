@@ -207,11 +207,7 @@ class TD7Policy(LearningPolicy):
         self.build(UpdateConfig(**self.parts), 0, jax.devices()[0])
 
     def build(self, config: UpdateConfig, seed: int, device: Any) -> None:
-        """
-        Initialise the networks.
-
-        :param config: of the algorithm; the policy keeps it as ``update_config``
-        """
+        """Initialise the networks; the policy keeps the algorithm's config as ``update_config``."""
         self.update_config = config
         key = jax.random.key(seed, impl=GENERATOR)
         self.agent_state = jax.device_put(init_state(config, self.n_obs, self.n_act, key), device)
