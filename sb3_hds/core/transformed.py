@@ -196,15 +196,12 @@ def transform_to_spec(transform: Transform) -> dict[str, Any]:
     return {"transform": transform.name} | fields
 
 
-def transform_from_spec(
-    spec: Mapping[str, Any], known: Iterable[type[Transform]] = TRANSFORMS
-) -> Transform:
+def transform_from_spec(spec: Mapping[str, Any]) -> Transform:
     """
     :param spec: what :func:`transform_to_spec` returned
-    :param known: the classes that the names of transforms stand for
     :raises ParameterError: for the name of another transform
     """
-    by_name = {transform.name: transform for transform in known}
+    by_name = {transform.name: transform for transform in TRANSFORMS}
     if spec["transform"] not in by_name:
         raise ParameterError(
             f"A twin was saved with the unknown transform '{spec['transform']}'. Known transforms: "
@@ -214,21 +211,16 @@ def transform_from_spec(
     return by_name[spec["transform"]](**fields)
 
 
-def seen_through(
-    base: Twin,
-    layers: Iterable[Iterable[Mapping[str, Any]]],
-    known: Iterable[type[Transform]] = TRANSFORMS,
-) -> Twin:
+def seen_through(base: Twin, layers: Iterable[Iterable[Mapping[str, Any]]]) -> Twin:
     """
     Rebuild the saved wrappers around a twin.
 
     :param base: the innermost twin
     :param layers: ``to_spec()["transforms"]``, the innermost wrapper first
-    :param known: the classes that the names of transforms stand for
     :raises ParameterError: for another transform, or one that does not fit the twin
     """
     for layer in layers:
-        parts = [transform_from_spec(part, known) for part in layer]
+        parts = [transform_from_spec(part) for part in layer]
         placed: Any = {
             name: p for p in parts for name, kind in _KINDS.items() if isinstance(p, kind)
         }

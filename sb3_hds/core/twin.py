@@ -76,7 +76,8 @@ class Twin(abc.ABC):
     channels: tuple[Channel, ...]
     parameters: Mapping[str, Parameter]
     max_episode_steps: int | None = None
-    #: ``"reverse"`` if reverse mode works, too; ``"forward"`` if only forward mode does
+    #: ``"reverse"`` if reverse mode works, too; ``"forward"`` if only forward mode does;
+    #: ``"differences"`` if both do, but a column costs a step: identification would take hours
     differentiability: str = "reverse"
     #: False if the reward is flat almost everywhere: then override ``planning_reward``
     reward_has_gradient: bool = True

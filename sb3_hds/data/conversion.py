@@ -37,23 +37,7 @@ _UNITS: dict[str, tuple[float, dict[str, int]]] = {
     "1": (1.0, {}),
 }
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
-_WITH_PREFIX = (
-    "rad",
-    "deg",
-    "s",
-    "m",
-    "g",
-    "N",
-    "Nm",
-    "A",
-    "V",
-    "W",
-    "J",
-    "Pa",
-    "Hz",
-    "ohm",
-    "rpm",
-)
+_WITH_PREFIX = "rad deg s m g N Nm A V W J Pa Hz ohm rpm"
 
 _SYNONYMS = {
     "radian": "rad",
@@ -192,7 +176,7 @@ def _symbol(name: str) -> str | None:
             return word
         if word in _SYNONYMS:
             return _SYNONYMS[word]
-    return name if name[:1] in _PREFIXES and name[1:] in _WITH_PREFIX else None
+    return name if name[:1] in _PREFIXES and name[1:] in _WITH_PREFIX.split() else None
 
 
 def _size_of(symbol: str) -> tuple[float, Mapping[str, int]]:

@@ -6,11 +6,7 @@ _LISTED = 40
 
 
 def counted(n: int, noun: str, plural: str = "") -> str:
-    """
-    :param n: number of things
-    :param noun: for one of them, as ``"row"`` or ``"row is"``
-    :param plural: for several; default: the noun with an s
-    """
+    """:return: ``"1 row"``, ``"2 rows"``; without ``plural``, that of the noun ends in an s"""
     return f"{n} {noun if n == 1 else plural or f'{noun}s'}"
 
 

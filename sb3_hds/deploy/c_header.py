@@ -120,9 +120,7 @@ def export_c(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> He
 
 
 def _identifier(stem: str) -> str:
-    """
-    :raises ExportError: for a name that is no identifier in C
-    """
+    """:raises ExportError: for a name that is no identifier in C"""
     found = re.sub(r"\W", "_", stem, flags=re.ASCII)
     if not re.match(r"[A-Za-z_]", found):
         raise ExportError(

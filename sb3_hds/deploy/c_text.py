@@ -108,9 +108,7 @@ def array_of(kind: str, symbol: str, values: np.ndarray) -> list[str]:
 
 
 def _literal(x: float, digits: int, suffix: str) -> str:
-    """
-    :raises ExportError: for a weight that is NaN
-    """
+    """:raises ExportError: for a weight that is NaN"""
     if np.isinf(x):
         return f"{'-' if x < 0 else ''}HUGE_VAL{suffix.upper()}"
     if np.isnan(x):

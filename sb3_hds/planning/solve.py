@@ -93,16 +93,11 @@ def random_controls(key: PRNGKeyArray, horizon: int, n_act: int, scale: float = 
 
 
 def best_of_random(
-    problem: Problem,
-    start: State,
-    key: PRNGKeyArray,
-    horizon: int,
-    n_candidates: int,
-    scale: float = 2.0,
+    problem: Problem, start: State, key: PRNGKeyArray, horizon: int, n_candidates: int
 ) -> Plan:
     """:return: the best of ``n_candidates`` random sequences"""
     keys = jax.random.split(key, n_candidates)
-    draw = lambda k: random_controls(k, horizon, problem.n_controls, scale)  # noqa: E731
+    draw = lambda k: random_controls(k, horizon, problem.n_controls)  # noqa: E731
     plans = jax.vmap(lambda k: simulate(problem, start, draw(k)))(keys)
     return jax.tree.map(lambda leaf: leaf[jnp.argmax(plans.value)], plans)
 

@@ -10,10 +10,8 @@ from jaxtyping import Float
 
 from sb3_hds.core import Trajectories, Twin
 from sb3_hds.core.trajectories.episodes import same_interval
-from sb3_hds.core.twin import plant_of
 from sb3_hds.data.resampling.report import Reading
 from sb3_hds.errors import CalibrationError
-from sb3_hds.twins.mujoco.engine.twin import EngineTwin
 
 # From this ratio of two intervals on, one is taken to be in another unit.
 _OTHER_UNIT = 100.0
@@ -77,17 +75,17 @@ def check_fits(twin: Twin, data: Trajectories) -> None:
         )
 
 
-def refuse_engine(twin: Twin, what: str) -> None:
+def refuse_slow(twin: Twin, what: str) -> None:
     """
     :param what: the name of the function that was called
-    :raises CalibrationError: for a twin on MuJoCo's engine
+    :raises CalibrationError: for a twin whose derivatives are finite differences
     """
-    if not isinstance(plant_of(twin), EngineTwin):
+    if twin.differentiability != "differences":
         return
     n_columns = 2 * len(twin.joints) + len(twin.parameters)
     raise CalibrationError(
-        f"{what} does not take {twin.name}, a twin on MuJoCo's engine: it linearises every window "
-        f"of the data for every candidate, here by {n_columns} finite differences of each step, "
-        "which takes hours. If nothing is in contact in the data, pass "
-        "twins.from_mujoco(model, ignore=['contacts', 'limits'])."
+        f"{what} does not take {twin.name}, whose derivatives are finite differences, as those of "
+        "MuJoCo's engine: it linearises every window of the data for every candidate, here by "
+        f"{n_columns} of them in each step, which takes hours. If nothing is in contact in the "
+        "data, pass twins.from_mujoco(model, ignore=['contacts', 'limits'])."
     )

@@ -26,10 +26,7 @@ class CheckItem(NamedTuple):
 
 
 def outcomes(name: str) -> tuple[Callable[..., CheckItem], Callable[..., CheckItem]]:
-    """
-    :param name: of the checked property
-    :return: constructors of its item if the check passed, and if it failed
-    """
+    """:return: constructors of a check's item if it passed, and if it failed"""
     return partial(CheckItem, name, True), partial(CheckItem, name, False)
 
 

@@ -69,11 +69,7 @@ def check_mechanics(plant: AnalyticTwin, points: Points) -> list[CheckItem]:
 
 
 def _power(plant: AnalyticTwin, params: Params, q: Position, v: Velocity) -> tuple[Scalar, Scalar]:
-    """
-    The power of the twin's own forces without a potential.
-
-    :return: the power, and the sum of the absolute values of its terms
-    """
+    """:return: the power of the twin's own forces without a potential, and the size of its terms"""
     change = jax.jvp(lambda q: plant.mass_matrix(q, params), (q,), (v,))[1]
     static, moving = (plant.bias(q, speed, params) for speed in (jnp.zeros_like(v), v))
     power = 0.5 * v @ change @ v - v @ (moving - static)

@@ -88,9 +88,7 @@ class OffPolicyTensorAlgorithm(TensorAlgorithm, OffPolicyAlgorithmJax):
         return learned
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        """
-        :raises ValueError: for a first observation that is not finite
-        """
+        """:raises ValueError: for a first observation that is not finite"""
         self._keep_statistics()
         self._pace.pause()
         found = super()._setup_learn(*args, **kwargs)

@@ -156,9 +156,7 @@ def checked_env(algorithm: type, env: Any) -> Any:
 
 
 def check_action_space(algorithm: type, space: spaces.Space) -> None:
-    """
-    :raises EnvironmentMismatchError: unless actions are a Box with finite limits
-    """
+    """:raises EnvironmentMismatchError: unless actions are a Box with finite limits"""
     name = algorithm.__name__
     if not isinstance(space, spaces.Box):
         raise EnvironmentMismatchError(
@@ -215,9 +213,7 @@ def check_buffer(model: Any, buffer: Any, path: Any) -> None:
 
 
 def check_has_env(model: Any) -> None:
-    """
-    :raises EnvironmentMismatchError: if there is nothing to learn in
-    """
+    """:raises EnvironmentMismatchError: if there is nothing to learn in"""
     if model.env is None:
         name = type(model).__name__
         raise EnvironmentMismatchError(
@@ -241,9 +237,7 @@ def checked_timesteps(total_timesteps: Any) -> int:
 
 
 def check_log_interval(log_interval: Any) -> None:
-    """
-    :raises ValueError: unless it is None or a whole number of at least 1
-    """
+    """:raises ValueError: unless it is None or a whole number of at least 1"""
     if log_interval is not None and not (is_whole(log_interval) and log_interval >= 1):
         raise ValueError(
             f"learn(log_interval={log_interval!r}): log_interval must be None, for no log, or a "

@@ -151,25 +151,19 @@ class Config:
             raise ValueError(self._objection(name, allowed))
 
     def require_counts(self, fewest: Mapping[str, int]) -> None:
-        """
-        :param fewest: smallest allowed value of each argument
-        """
+        """:param fewest: smallest allowed value of each argument"""
         for name, least in fewest.items():
             may_be_none = name in self.derived
             allowed = f"a whole number of at least {least}" + " or None" * may_be_none
             self.require(is_count(getattr(self, name), least, may_be_none), name, allowed)
 
     def require_range(self, low: float, high: float, allowed: str, *names: str) -> None:
-        """
-        :param names: of arguments that must be finite numbers from ``low`` to ``high``
-        """
+        """:param names: of arguments that must be finite numbers from ``low`` to ``high``"""
         for name in names:
             self.require(between(getattr(self, name), low, high), name, allowed)
 
     def require_choice(self, name: str, choices: Sequence[Any]) -> None:
-        """
-        :param choices: allowed values
-        """
+        """:param choices: allowed values"""
         allowed = f"one of {', '.join(map(repr, choices))}"
         self.require(getattr(self, name) in choices, name, allowed)
 
@@ -236,9 +230,7 @@ class OffPolicyConfig(Config):
         self.require_rate("learning_rate")
 
     def require_rate(self, name: str) -> None:
-        """
-        :param name: of a learning rate
-        """
+        """:param name: of a learning rate"""
         rate = getattr(self, name)
         fine = callable(rate) or isinstance(rate, str) or between(rate, 0.0, math.inf)
         self.require(fine, name, "a finite number of at least 0, or a schedule")
@@ -265,9 +257,7 @@ def is_count(value: Any, least: int, may_be_none: bool = False) -> bool:
 
 
 def check_count(name: str, value: Any, least: int = 1) -> None:
-    """
-    :raises ValueError: unless it is a whole number of at least ``least``
-    """
+    """:raises ValueError: unless it is a whole number of at least ``least``"""
     if not is_count(value, least):
         raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
 

@@ -37,11 +37,7 @@ class Pace:
         self._since: float | None = None
 
     def collected(self, model: Learner, n_steps: int) -> None:
-        """
-        Start timing: a collection of steps has ended, and its updates follow.
-
-        :param n_steps: steps of the environment in the collection
-        """
+        """Start timing: ``n_steps`` steps were collected, and their updates follow."""
         if not self._done:
             self._since = time.perf_counter()
             self._new_steps, self._updates_before = n_steps, model._n_updates

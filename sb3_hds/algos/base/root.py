@@ -37,9 +37,7 @@ if TYPE_CHECKING:
 
 @contextlib.contextmanager
 def _space_mismatch_reported() -> Iterator[None]:
-    """
-    :raises EnvironmentMismatchError: where SB3 finds that spaces do not match
-    """
+    """:raises EnvironmentMismatchError: where SB3 finds that spaces do not match"""
     try:
         yield
     except ValueError as error:
@@ -117,9 +115,7 @@ class TensorAlgorithm(BaseAlgorithm):
 
     @staticmethod
     def check_observations(space: spaces.Space) -> None:
-        """
-        :raises EnvironmentMismatchError: for observations that the algorithm cannot use
-        """
+        """:raises EnvironmentMismatchError: for observations that the algorithm cannot use"""
 
     def save(
         self,

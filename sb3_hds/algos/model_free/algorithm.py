@@ -154,11 +154,7 @@ class ModelFreeAlgorithm(OffPolicyTensorAlgorithm):
     check_observations = staticmethod(check_observations)
 
     def set_random_seed(self, seed: int | None = None) -> None:
-        """
-        SB3's ``set_random_seed``, which also resets the random keys of updates and policies.
-
-        :param seed: None: nothing changes
-        """
+        """SB3's, which also resets the random keys of updates and policies; None: no change."""
         super().set_random_seed(seed)
         if seed is not None and hasattr(self, "policy"):
             self.policy.set_random_seed(seed)
@@ -311,9 +307,7 @@ class ModelFreeAlgorithm(OffPolicyTensorAlgorithm):
         return rate, self._rate("qf_learning_rate", schedule_of(self.qf_learning_rate))
 
     def _rate(self, name: str, schedule: Schedule) -> float:
-        """
-        :raises ValueError: unless it is a finite number of at least 0
-        """
+        """:raises ValueError: unless it is a finite number of at least 0"""
         # The last collection may exceed ``total_timesteps``.
         remaining = max(0.0, self._current_progress_remaining)
         rate = float(schedule(remaining))
@@ -335,10 +329,7 @@ class ModelFreeAlgorithm(OffPolicyTensorAlgorithm):
             )
 
     def warn_of_unused(self, config: Config, *names: str, why: str) -> None:
-        """
-        :param names: of arguments that have no effect
-        :param why: the reason, for the warning
-        """
+        """Warn of arguments that have no effect, and say why."""
         unused = [name for name in names if not config.is_default(name)]
         if unused:
             warnings.warn(f"{type(self).__name__} ignores {', '.join(unused)}: {why}.")

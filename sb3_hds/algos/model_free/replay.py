@@ -11,9 +11,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 
 class Batch(NamedTuple):
-    """
-    Transitions. ``discount`` multiplies the next value: :math:`\\gamma^n` for n-step returns.
-    """
+    """Transitions. ``discount`` multiplies the next value: :math:`\\gamma^n` for n-step returns."""
 
     obs: Float[Array, "*batch obs"]
     action: Float[Array, "*batch act"]

@@ -57,10 +57,7 @@ def apply_schedule(
 
 
 def zero_metrics(kind: type[AnyMetrics]) -> AnyMetrics:
-    """
-    :param kind: a named tuple of numbers
-    :return: metrics before the first update
-    """
+    """:return: metrics before the first update, of a named tuple of numbers"""
     # NumPy: JAX would dispatch a program for each of them at every step.
     zero: Any = np.zeros((), jnp.result_type(float))
     return kind._make(zero for _ in kind._fields)

@@ -201,7 +201,6 @@ class OpenLoop(TensorAlgorithm):
                 f"{', '.join(self.robot['names'])}."
             )
         self.policy.robot = Robot(**self.robot)
-        self.policy.constants = self.policy.constants
         self._choose_joint_source()
 
     def learn(

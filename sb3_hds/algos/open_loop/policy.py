@@ -4,11 +4,10 @@ import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
 
@@ -16,40 +15,26 @@ from sb3_hds.algos.base.policy import TensorPolicy, check_observation
 from sb3_hds.algos.open_loop.cma_es import SearchState
 from sb3_hds.algos.open_loop.gait import Constants
 from sb3_hds.algos.open_loop.robot import Robot
-from sb3_hds.core.transforms.oscillators import Gait, advance_phase, target_at
+from sb3_hds.core.transforms.oscillators import advance_phase
 from sb3_hds.deploy.policy_function import Joints, Memory, PolicyFunction
 from sb3_hds.errors import EnvironmentMismatchError
 from sb3_hds.wrappers.actuated_joints import track
 
-# Number of steps for which targets are computed at once.
-_CHUNK = 1_000
-
 Targets = Float[np.ndarray, "n_envs act"]
 
 
-class Timetable:
+def targets_of(gaits: Constants, steps: Int[np.ndarray, " n"], dt: float) -> Targets:
     """
-    Targets of several gaits at every step, computed a thousand steps at a time. The target of
-    action k, which acts from k dt to (k + 1) dt, is that of the middle of this interval.
+    The target of action k, which acts from k dt to (k + 1) dt, is that of the middle of this
+    interval.
 
     :param gaits: stacked, one per row
+    :param steps: k of each row
     :param dt: time step [s]
     """
-
-    def __init__(self, gaits: Constants, dt: float) -> None:
-        # Double precision, for phases of thousands of turns.
-        with jax.enable_x64(True):
-            self._gait = Gait(*(jnp.asarray(part, float) for part in gaits[:5]))
-        self._dt = dt
-        self._targets = np.zeros((len(gaits.amplitude), 0, gaits.amplitude.shape[1]))
-
-    def at(self, rows: Int[np.ndarray, " n"], steps: Int[np.ndarray, " n"]) -> Targets:
-        """:return: targets of the gaits ``rows``, each in its step of ``steps``"""
-        while steps.size and self._targets.shape[1] <= int(steps.max()):
-            with jax.enable_x64(True):
-                more = _targets(self._gait, float(self._targets.shape[1]), self._dt)
-            self._targets = np.concatenate([self._targets, np.asarray(more)], axis=1)
-        return self._targets[rows, steps]
+    omegas = (omega[:, None] for omega in (gaits.omega_swing, gaits.omega_stance))
+    phase = advance_phase(gaits.phase, (steps[:, None] + 0.5) * dt, *omegas)
+    return gaits.amplitude * np.sin(phase) + gaits.offset
 
 
 class OscillatorPolicy(TensorPolicy):
@@ -62,7 +47,6 @@ class OscillatorPolicy(TensorPolicy):
     :param action_space: a bounded Box of any shape
     :param lr_schedule: passed by SB3; not used
     :param robot: time step and joints, see :class:`~sb3_hds.algos.open_loop.robot.Robot`
-    :param use_sde: passed by SB3; not used
     """
 
     def __init__(
@@ -71,7 +55,6 @@ class OscillatorPolicy(TensorPolicy):
         action_space: spaces.Box,
         lr_schedule: Schedule,
         robot: Robot | Mapping[str, Any] | None = None,
-        use_sde: bool = False,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=False)
         n = int(np.prod(action_space.shape))
@@ -95,8 +78,6 @@ class OscillatorPolicy(TensorPolicy):
     @constants.setter
     def constants(self, constants: Constants) -> None:
         self._constants = Constants(*(np.asarray(part, float) for part in constants))
-        rows = Constants(*(part[None] for part in self._constants))
-        self._timetable = Timetable(rows, self.robot.dt if self.robot else 1.0)
 
     def predict(
         self,
@@ -126,8 +107,9 @@ class OscillatorPolicy(TensorPolicy):
             steps = np.asarray(state[0]).copy()
         if episode_start is not None:
             steps[np.broadcast_to(np.asarray(episode_start, bool), steps.shape)] = 0
-        targets = self._timetable.at(np.zeros(n, int), steps)
-        actions = self.command(targets, rows, self.constants.kp, self.constants.kd)
+        gaits = Constants(*(np.stack([part] * n) for part in self.constants))
+        targets = targets_of(gaits, steps, self._dt)
+        actions = self.command(targets, rows, gaits.kp, gaits.kd)
         return actions if several else actions[0], (steps + 1,)
 
     def command(self, targets: Targets, observations: Any, kp: Any, kd: Any) -> np.ndarray:
@@ -146,11 +128,14 @@ class OscillatorPolicy(TensorPolicy):
         assert isinstance(box, spaces.Box)
         return np.clip(targets.reshape(-1, *box.shape), box.low, box.high).astype(box.dtype)
 
+    @property
+    def _dt(self) -> float:
+        return self.robot.dt if self.robot else 1.0
+
     def policy_function(self) -> PolicyFunction:
         """:return: the policy with the phases of its oscillators as memory, to be exported"""
         robot, gait = self.robot, self.constants
-        omega = float(gait.omega_swing), float(gait.omega_stance)
-        dt = robot.dt if robot else 1.0
+        omega, dt = (float(gait.omega_swing), float(gait.omega_stance)), self._dt
         tracks = robot is not None and robot.control == "track"
         seen = tracks and bool(robot.seen_position)  # type: ignore[union-attr]
 
@@ -224,10 +209,3 @@ class OscillatorPolicy(TensorPolicy):
     @training_state.setter
     def training_state(self, tree: Any) -> None:
         self.search = tree
-
-
-@jax.jit
-def _targets(gaits: Gait, first: float, dt: float) -> Float[Array, "gaits chunk act"]:
-    times = (first + jnp.arange(_CHUNK) + 0.5) * dt
-    of_one = jax.vmap(target_at, in_axes=(None, 0))
-    return jax.vmap(of_one, in_axes=(0, None))(gaits, times)

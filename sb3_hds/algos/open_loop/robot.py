@@ -136,9 +136,7 @@ def state_vectors(env: VecEnv) -> Float[np.ndarray, "n_envs state"]:
 
 
 def refuse_without_state(env: VecEnv) -> None:
-    """
-    :raises EnvironmentMismatchError: if the environment does not show its state
-    """
+    """:raises EnvironmentMismatchError: if the environment does not show its state"""
     if not env.has_attr("state_vector"):
         raise EnvironmentMismatchError(
             "Joints can be read from Gymnasium's MuJoCo environments, which have a method "

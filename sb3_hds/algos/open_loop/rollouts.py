@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_hds.algos.open_loop.gait import Constants
-from sb3_hds.algos.open_loop.policy import OscillatorPolicy, Timetable
+from sb3_hds.algos.open_loop.policy import OscillatorPolicy, targets_of
 
 
 class Trial(NamedTuple):
@@ -77,7 +77,7 @@ class Trials:
         :return: whether all trials are complete; False: no more timesteps, or the callback stopped
         """
         assert self._policy.robot is not None
-        timetable, waiting = Timetable(gaits, self._policy.robot.dt), deque(trials)
+        dt, waiting = self._policy.robot.dt, deque(trials)
         running: list[Trial | None] = [None] * self._env.num_envs
         if not self._one_by_one:
             self._model._last_obs = self._env.reset()  # type: ignore[assignment]
@@ -85,8 +85,8 @@ class Trials:
             running[copy] = self._start(copy, waiting)
         while any(trial is not None for trial in running):
             rows = np.array([trial.row if trial else 0 for trial in running])
-            targets = timetable.at(rows, self._steps)
-            if not self._step(targets, gaits.kp[rows], gaits.kd[rows]):
+            acting = Constants(*(part[rows] for part in gaits))
+            if not self._step(targets_of(acting, self._steps, dt), acting.kp, acting.kd):
                 return False
             for copy, trial in enumerate(running):
                 cut = self._one_by_one and self._steps[copy] == horizon

@@ -52,11 +52,7 @@ def choose_policy(
 
 
 def is_compared(n_epochs: int, every: int, anyway: bool) -> bool:
-    """
-    :param every: epochs between two comparisons; 0: no comparisons
-    :param anyway: compare after each epoch, unless ``every`` is 0
-    :return: whether policies are compared after this number of epochs
-    """
+    """:return: whether policies are compared: ``anyway``, or every n-th epoch; 0: never"""
     return every > 0 and (anyway or n_epochs % every == 0)
 
 

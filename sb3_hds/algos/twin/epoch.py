@@ -94,11 +94,7 @@ class KeptPlans(NamedTuple):
 def epoch(
     config: EpochConfig, state: EpochState, hyper: Hyperparams
 ) -> tuple[EpochState, EpochMetrics]:
-    """
-    Plan from every start state, keep plans that are better than the policy, regress on them.
-
-    :return: the state after the epoch, and its metrics
-    """
+    """Plan from every start state, keep plans that are better than the policy, regress on them."""
     state, metrics = plan_ahead(config, state, hyper)
     state, losses = learn_from_plans(config, state, hyper)
     return state, EpochMetrics(metrics, *losses)

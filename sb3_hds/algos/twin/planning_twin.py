@@ -25,9 +25,7 @@ _N_ROLLOUTS, _N_STEPS = 64, 50
 
 
 def check_twin_observes(space: spaces.Space) -> None:
-    """
-    :raises EnvironmentMismatchError: for anything but a Box with one axis
-    """
+    """:raises EnvironmentMismatchError: for anything but a Box with one axis"""
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise EnvironmentMismatchError(
             f"A twin observes a Box with one axis, and this environment observes {space}. Use one "
@@ -36,9 +34,7 @@ def check_twin_observes(space: spaces.Space) -> None:
 
 
 def check_reward(twin: Twin) -> None:
-    """
-    :raises RewardError: if the twin has no reward with a gradient and no planning reward
-    """
+    """:raises RewardError: if the twin has no reward with a gradient and no planning reward"""
     base = plant_of(twin)
     surrogate = type(base).planning_reward is not Twin.planning_reward
     if not surrogate and type(base).reward is Twin.reward:

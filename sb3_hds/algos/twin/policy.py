@@ -257,17 +257,13 @@ class TwinPolicyConfig(PolicyConfig):
     use_sde: bool = False
 
     def __post_init__(self) -> None:
-        """
-        :raises ValueError: for arguments out of range
-        """
+        """:raises ValueError: for arguments out of range"""
         if not self.max_grad_norm > 0.0:
             raise ValueError(f"max_grad_norm must be above 0, got {self.max_grad_norm!r}.")
 
 
 class TwinPolicy(TensorPolicy):
-    """
-    A policy network and a value network, with their own normalisation of inputs.
-    """
+    """A policy network and a value network, with their own normalisation of inputs."""
 
     @takes(TwinPolicyConfig)
     def __init__(self, config: TwinPolicyConfig) -> None:
@@ -284,12 +280,7 @@ class TwinPolicy(TensorPolicy):
         self.build(jax.random.key(0, impl=GENERATOR), jax.devices()[0])
 
     def build(self, key: jax.Array, device: Any) -> None:
-        """
-        Initialise the networks.
-
-        :param key: of the generator ``unsafe_rbg``
-        :param device: of JAX
-        """
+        """Initialise the networks by a key of the generator ``unsafe_rbg``."""
         n_obs = spaces.flatdim(self.observation_space)
         networks, progress = fresh_networks(
             self.actor_network, self.value_network, n_obs, self.max_grad_norm, key

@@ -113,9 +113,7 @@ class OwnSeries(Logger):
         self._logger, self._n_epochs = logger, n_epochs
 
     def dump(self, step: int = 0) -> None:
-        """
-        :param step: ignored
-        """
+        """:param step: ignored"""
         for name, value in self.name_to_value.items():
             own = f"pretrain/{name.removeprefix('train/')}"
             self._logger.record(own, value, exclude=self.name_to_excluded[name])

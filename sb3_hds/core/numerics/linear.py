@@ -26,10 +26,7 @@ class Factor(NamedTuple):
 
 
 def uses_lapack(n: int) -> bool:
-    """
-    :param n: number of rows
-    :return: whether LAPACK solves such systems; two such programs must not run at the same time
-    """
+    """:return: whether LAPACK solves ``n`` rows; two such programs must not run at the same time"""
     return n > _LOOPED
 
 

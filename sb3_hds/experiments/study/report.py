@@ -217,24 +217,21 @@ def _bars(axis: Any, names: Sequence[str], values: Any, ends: Any, title: str) -
 
 
 def _page(study: Study, root: Path, table: pd.DataFrame, images: dict[str, str]) -> str:
-    from jinja2 import Environment
+    from jinja2 import Environment, FileSystemLoader
 
     runs = [run for run in study.runs if is_complete(study, run, root)]
     marks = [json.loads((root / run.place / MARK).read_text()) for run in runs]
-    return (
-        Environment(autoescape=True)
-        .from_string(_TEMPLATE)
-        .render(
-            study=study,
-            n_runs=len(runs),
-            rows=_rows(table),
-            images=images,
-            hyperparams=_hyperparams(runs, root),
-            versions=marks[0]["versions"],
-            machines={json.dumps(mark["machine"], sort_keys=True) for mark in marks},
-            commands=[" ".join(map(str, mark["command"])) for mark in marks],
-            level=round(100 * _LEVEL),
-        )
+    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
+    return pages.get_template("report.html").render(
+        study=study,
+        n_runs=len(runs),
+        rows=_rows(table),
+        images=images,
+        hyperparams=_hyperparams(runs, root),
+        versions=marks[0]["versions"],
+        machines={json.dumps(mark["machine"], sort_keys=True) for mark in marks},
+        commands=[" ".join(map(str, mark["command"])) for mark in marks],
+        level=round(100 * _LEVEL),
     )
 
 
@@ -265,49 +262,3 @@ def _hyperparams(runs: Sequence[Run], root: Path) -> dict[str, str]:
         if key not in found and file.exists():
             found[key] = file.read_text()
     return found
-
-
-_TEMPLATE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{{ study.name }}</title>
-<style>
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem }
-table { border-collapse: collapse } td, th { padding: .2rem .8rem; text-align: right }
-td:first-child, td:nth-child(2), th:first-child, th:nth-child(2) { text-align: left }
-tr { border-bottom: 1px solid #ccc } img { max-width: 100% }
-pre { overflow-x: auto; font-size: 80% }
-</style></head><body>
-<h1>{{ study.name }}</h1>
-<p>{{ n_runs }} of {{ study.runs | length }} runs are complete.
-{% if study.steps is number %}{{ "{:,}".format(study.steps) }} steps each{% endif %}
-{% if study.minutes %}{{ study.minutes }} minutes each, at most{% endif %};
-{{ study.episodes }} episodes every {{ "{:,}".format(study.every) }} steps.</p>
-<h2>Final returns</h2>
-<table><tr><th>environment</th><th>algorithm</th><th>seeds</th><th>mean</th>
-<th>{{ level }} % interval</th><th>steps</th><th>wall time [s]</th></tr>
-{% for row in rows %}<tr><td>{{ row.env }}</td><td>{{ row.label }}</td><td>{{ row.seeds }}</td>
-<td>{{ row.mean }}</td><td>{{ row.interval }}</td><td>{{ row.steps }}</td>
-<td>{{ row.seconds }}</td></tr>
-{% endfor %}</table>
-<p>From the last evaluation of each run, with bootstrap intervals of the mean over seeds.</p>
-<h2>Curves</h2>
-<p>Means over seeds with {{ level }} % intervals. Wall time includes training and evaluations;
-runs that share a machine slow each other down.</p>
-<img alt="returns against steps and wall time" src="data:image/png;base64,{{ images.curves }}">
-{% if images.iqm %}<h2>All environments</h2>
-<p>Returns are normalised in each environment: 0 is the lowest evaluation of any run there, 1 the
-highest final return. Interquartile means, performance profiles and probabilities of improvement
-with {{ level }} % intervals by rliable's stratified bootstrap.</p>
-{% for name in ("iqm", "profiles", "improvement") %}
-<p><img alt="{{ name }}" src="data:image/png;base64,{{ images[name] }}"></p>{% endfor %}{% endif %}
-<h2>Hyperparameters</h2>
-{% for name, text in hyperparams.items() %}<details><summary>{{ name }}</summary>
-<pre>{{ text }}</pre></details>{% endfor %}
-<h2>Versions and machines</h2>
-<pre>{% for name, version in versions.items() %}{{ name }} {{ version }}
-{% endfor %}{% for machine in machines %}{{ machine }}
-{% endfor %}</pre>
-<h2>Commands</h2>
-<pre>{% for command in commands %}{{ command }}
-{% endfor %}</pre>
-</body></html>
-"""

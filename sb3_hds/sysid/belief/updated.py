@@ -23,8 +23,6 @@ import numpy as np
 from jaxtyping import Array
 
 from sb3_hds.core import Trajectories, Twin
-from sb3_hds.core.trajectories.episodes import same_interval
-from sb3_hds.errors import CalibrationError
 from sb3_hds.sysid.belief.answers import Answer, Answers, bounds_of, union
 from sb3_hds.sysid.estimation.shooting import (
     Shots,
@@ -34,6 +32,7 @@ from sb3_hds.sysid.estimation.shooting import (
     simulate,
     with_slopes,
 )
+from sb3_hds.sysid.measurements import check_fits
 
 # Gauss-Newton steps, and the threshold of Huber's loss, in units of the noise.
 _STEPS, _HUBER = 8, 3.0
@@ -48,13 +47,7 @@ def updated(answers: Answers, data: Trajectories) -> Answers:
     :raises TrajectoryError: if no recording is long enough
     """
     twin, values, factor = union(answers.answers)
-    fits = (data.n_obs, data.n_act) == (len(twin.channels), len(twin.actuators))
-    if not (fits and same_interval(data.dt, twin.dt)):
-        raise CalibrationError(
-            f"{twin.name} observes {len(twin.channels)} channels every {twin.dt:g} s and takes "
-            f"{len(twin.actuators)} commands; the recordings have {data.n_obs} and {data.n_act}, "
-            f"every {data.dt:g} s. Choose the columns, or resample: data.resample(dt={twin.dt:g})."
-        )
+    check_fits(twin, data)
     length = min(answers.window, int(data.lengths.max()))
     shots, _ = shots_of(data, length, twin)
     low, high = bounds_of(twin)

@@ -96,9 +96,9 @@ class Evaluation(NamedTuple):
 
 class Excitation:
     """
-    :param twin: has the effects of all answers
     Commands as sums of sines, and what they would decide.
 
+    :param twin: has the effects of all answers
     :param bounds: limits of the machine
     :param n_steps: of a recording
     :param window: steps of the windows in which answers will be compared
@@ -148,7 +148,7 @@ class Excitation:
             over = jnp.maximum(finite - _NEAR, 0.0)
             return -objective + _PRICE * jnp.sum(over**2), (objective, jnp.max(finite))
 
-        if self.twin.differentiability == "reverse":
+        if self.twin.differentiability != "forward":
             (_, found), slopes = jax.vmap(jax.value_and_grad(cost, has_aux=True))(coefficients)
         else:
             slopes, found = jax.vmap(jax.jacfwd(cost, has_aux=True))(coefficients)

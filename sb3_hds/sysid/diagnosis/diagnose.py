@@ -12,7 +12,7 @@ from sb3_hds.effects import ALL, effect_named
 from sb3_hds.errors import CalibrationError, EffectError
 from sb3_hds.sysid.diagnosis.pipeline import EFFORTS, Inquiry
 from sb3_hds.sysid.estimation.parameters import Belief
-from sb3_hds.sysid.measurements import check_fits, refuse_engine
+from sb3_hds.sysid.measurements import check_fits, refuse_slow
 from sb3_hds.sysid.progress import Bar
 from sb3_hds.sysid.reporting.diagnosis import Diagnosis
 
@@ -67,7 +67,7 @@ def diagnose(
         )
     twin = twin.member(0) if isinstance(twin, BeliefTwin) else twin
     check_methods(twin)
-    refuse_engine(twin, "diagnose")
+    refuse_slow(twin, "diagnose")
     cache_compiled_programs()
     check_fits(twin, data)
     if budget not in EFFORTS:

@@ -23,7 +23,7 @@ from sb3_hds.sysid.estimation.normal_equations import Uncertainty, covariance_of
 from sb3_hds.sysid.estimation.parameters import Free, free_names, nominal_values, one_each, tie
 from sb3_hds.sysid.estimation.results import Estimate, Fit
 from sb3_hds.sysid.estimation.shooting import Shots, n_free, shots_of
-from sb3_hds.sysid.measurements import NORMAL, channel_deviations, check_fits, refuse_engine
+from sb3_hds.sysid.measurements import NORMAL, channel_deviations, check_fits, refuse_slow
 
 # Length of a window where none is given [s], within these numbers of steps.
 _WINDOW = 0.5
@@ -92,7 +92,7 @@ def calibrate(
     :raises TwinError: for a twin whose methods do not return what they have to
     """
     check_methods(twin)
-    refuse_engine(twin, "calibrate")
+    refuse_slow(twin, "calibrate")
     cache_compiled_programs()
     wanted = tie(twin, free_names(twin, free), tied or {})
     check_fits(twin, data)

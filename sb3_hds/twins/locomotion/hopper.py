@@ -3,16 +3,14 @@
 import jax.numpy as jnp
 
 from sb3_hds.core import Actuator, Channel, Joint, State
-from sb3_hds.core.types import Flag, Scalar
-from sb3_hds.twins.locomotion.task import HealthyTask, inside, margin
+from sb3_hds.core.types import Flag
+from sb3_hds.twins.locomotion.task import PlanarWalker, inside
 from sb3_hds.twins.mujoco.engine.values import declared, natives
 
 _LEG = ("thigh_joint", "leg_joint", "foot_joint")
-# Width of the soft limits of the planning reward.
-_HEIGHT, _ANGLE = 0.05, 0.04  # [m], [rad]
 
 
-class Hopper(HealthyTask):
+class Hopper(PlanarWalker):
     r"""
     A leg of three links under a torso, in the plane. It ends when the torso is too low or tilts.
 
@@ -22,17 +20,12 @@ class Hopper(HealthyTask):
     (``healthy_z_range``), tilts by less than 0.2 rad (``healthy_angle_range``), and all other
     numbers of the state are below 100 in size (``healthy_state_range``).
 
-    The observation clips velocities to 10, so :meth:`infer` does not recover faster ones. Planning
-    replaces the indicator by a product of logistic functions of height and angle, 1/2 at the
-    limits.
+    Velocities are clipped to 10 in the observation, and planning softens the limits.
     """
 
     name = "Hopper"
     env_id = "Hopper-v5"
-    dt = 0.008
-    substeps = 4
-    max_episode_steps = 1000
-    max_speed = 10.0
+    angle_width = 0.04
     options = {
         "xml_file": "hopper.xml",
         "forward_reward_weight": 1.0,
@@ -46,8 +39,6 @@ class Hopper(HealthyTask):
         "exclude_current_positions_from_observation": True,
     }
     healthy_state_range: tuple[float, float]
-    healthy_z_range: tuple[float, float]
-    healthy_angle_range: tuple[float, float]
     joints = (Joint("rootx", "m"), Joint("rootz", "m"), Joint("rooty"), *map(Joint, _LEG))
     positions = tuple(Channel(f"{joint.name}_position", joint.unit) for joint in joints)
     actuators = tuple(Actuator(joint, "1", -1.0, 1.0) for joint in _LEG)
@@ -66,9 +57,4 @@ class Hopper(HealthyTask):
     def healthy(self, state: State) -> Flag:
         rest = jnp.concatenate([state.q[2:], state.v])
         fine = jnp.all(inside(rest, *self.healthy_state_range))
-        height = inside(state.q[1], *self.healthy_z_range)
-        return fine & height & inside(state.q[2], *self.healthy_angle_range)
-
-    def health(self, state: State) -> Scalar:
-        height = margin(state.q[1], *self.healthy_z_range, _HEIGHT)
-        return height * margin(state.q[2], *self.healthy_angle_range, _ANGLE)
+        return fine & super().healthy(state)

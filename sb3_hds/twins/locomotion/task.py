@@ -25,6 +25,8 @@ _SEEN = ("cam_", "light_", "tex_", "mat_", "name", "skin_", "geom_rgba", "site_r
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0")
 # [m], where the derivative of a distance ends.
 _LEAST = 1e-5
+# Width of the soft limits of the height of a planar walker [m].
+_HEIGHT = 0.05
 _OPTIONS = ("integrator", "cone", "solver", "iterations", "density", "viscosity", "disableflags")
 
 
@@ -170,6 +172,33 @@ class HealthyTask(ForwardTask):
 
     def terminated(self, state: State, params: Params) -> Flag:
         return ~self.healthy(state) & bool(self.terminate_when_unhealthy)
+
+
+class PlanarWalker(HealthyTask):
+    """
+    Abstract: legs under a torso, in the plane; healthy while the torso is high and upright enough.
+
+    The observation clips velocities to 10, so :meth:`infer` does not recover faster ones. Planning
+    replaces the indicator by a product of logistic functions of height and angle, 1/2 at the
+    limits.
+    """
+
+    dt = 0.008
+    substeps = 4
+    max_episode_steps = 1000
+    max_speed = 10.0
+    #: width of the soft limits of the angle [rad]
+    angle_width: ClassVar[float]
+    healthy_z_range: tuple[float, float]
+    healthy_angle_range: tuple[float, float]
+
+    def healthy(self, state: State) -> Flag:
+        height = inside(state.q[1], *self.healthy_z_range)
+        return height & inside(state.q[2], *self.healthy_angle_range)
+
+    def health(self, state: State) -> Scalar:
+        height = margin(state.q[1], *self.healthy_z_range, _HEIGHT)
+        return height * margin(state.q[2], *self.healthy_angle_range, self.angle_width)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,17 +1,14 @@
 """Twin of Gymnasium's ``Walker2d-v5``."""
 
-from sb3_hds.core import Actuator, Channel, Joint, State
-from sb3_hds.core.types import Flag, Scalar
-from sb3_hds.twins.locomotion.task import HealthyTask, inside, margin
+from sb3_hds.core import Actuator, Channel, Joint
+from sb3_hds.twins.locomotion.task import PlanarWalker
 from sb3_hds.twins.mujoco.engine.values import declared, natives
 
 _RIGHT = ("thigh_joint", "leg_joint", "foot_joint")
 _LEGS = (*_RIGHT, "thigh_left_joint", "leg_left_joint", "foot_left_joint")
-# Width of the soft limits of the planning reward.
-_HEIGHT, _ANGLE = 0.05, 0.1  # [m], [rad]
 
 
-class Walker2d(HealthyTask):
+class Walker2d(PlanarWalker):
     r"""
     Two legs of three links under a torso, in the plane. It ends when the torso is too low, too high
     or tilts.
@@ -21,17 +18,12 @@ class Walker2d(HealthyTask):
     with :math:`w = h = 1` and :math:`c` = 1e-3. Healthy: the torso is between 0.8 and 2 m high
     (``healthy_z_range``) and tilts by less than 1 rad (``healthy_angle_range``).
 
-    The observation clips velocities to 10, so :meth:`infer` does not recover faster ones. Planning
-    replaces the indicator by a product of logistic functions of height and angle, 1/2 at the
-    limits.
+    Velocities are clipped to 10 in the observation, and planning softens the limits.
     """
 
     name = "Walker2d"
     env_id = "Walker2d-v5"
-    dt = 0.008
-    substeps = 4
-    max_episode_steps = 1000
-    max_speed = 10.0
+    angle_width = 0.1
     options = {
         "xml_file": "walker2d_v5.xml",
         "forward_reward_weight": 1.0,
@@ -43,8 +35,6 @@ class Walker2d(HealthyTask):
         "reset_noise_scale": 5e-3,
         "exclude_current_positions_from_observation": True,
     }
-    healthy_z_range: tuple[float, float]
-    healthy_angle_range: tuple[float, float]
     joints = (Joint("rootx", "m"), Joint("rootz", "m"), Joint("rooty"), *map(Joint, _LEGS))
     positions = tuple(Channel(f"{joint.name}_position", joint.unit) for joint in joints)
     actuators = tuple(Actuator(joint, "1", -1.0, 1.0) for joint in _LEGS)
@@ -62,11 +52,3 @@ class Walker2d(HealthyTask):
         motors=_LEGS,
     )
     native_effects = natives(joints, actuators, parameters)
-
-    def healthy(self, state: State) -> Flag:
-        height = inside(state.q[1], *self.healthy_z_range)
-        return height & inside(state.q[2], *self.healthy_angle_range)
-
-    def health(self, state: State) -> Scalar:
-        height = margin(state.q[1], *self.healthy_z_range, _HEIGHT)
-        return height * margin(state.q[2], *self.healthy_angle_range, _ANGLE)

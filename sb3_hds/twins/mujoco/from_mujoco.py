@@ -15,7 +15,8 @@ from sb3_hds.twins.mujoco.files.refusals import refuse
 from sb3_hds.twins.mujoco.files.shapes import shapes_of
 from sb3_hds.twins.mujoco.identifiability import unidentifiable
 from sb3_hds.twins.mujoco.mechanism import Drive, Link, Mechanism
-from sb3_hds.twins.mujoco.twin import MechanismTwin, Reward, Terminated
+from sb3_hds.twins.mujoco.model_twin import Reward, Terminated
+from sb3_hds.twins.mujoco.twin import MechanismTwin
 
 _KINDS = ("torque", "position", "velocity")
 

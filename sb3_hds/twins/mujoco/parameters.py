@@ -346,9 +346,9 @@ def _largest(drive: Drive, link: Link) -> float:
     return min(known, default=0.0)
 
 
-def random_positions(mechanism: Mechanism, n: int, seed: int = 0) -> list[np.ndarray]:
+def random_positions(mechanism: Mechanism, n: int) -> list[np.ndarray]:
     """:return: one array of ``n`` samples for each number of a position"""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     found: list[np.ndarray] = []
     for link in mechanism.links:
         if link.quaternion:

@@ -4,33 +4,20 @@ import copy
 import hashlib
 import json
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from sb3_hds.core import Actuator, AnalyticTwin, Channel, Joint, State, rk4, semi_implicit_euler
-from sb3_hds.core.types import (
-    Action,
-    Coordinates,
-    Flag,
-    Force,
-    MassMatrix,
-    Obs,
-    Params,
-    Position,
-    Scalar,
-    Tangent,
-    Velocity,
-)
+from sb3_hds.core.types import Action, Force, MassMatrix, Params, Position, Velocity
 from sb3_hds.errors import ParameterError
 from sb3_hds.twins.mujoco.actuators import Actuation, Moving
 from sb3_hds.twins.mujoco.equation import Equation
 from sb3_hds.twins.mujoco.mechanism import FREE, SLIDE, Mechanism
+from sb3_hds.twins.mujoco.model_twin import ModelTwin, Reward, Terminated
 from sb3_hds.twins.mujoco.parameters import (
     dof_names,
     named_bodies,
@@ -42,18 +29,11 @@ from sb3_hds.twins.mujoco.parameters import (
 )
 from sb3_hds.twins.mujoco.rigid_body import algebra as alg
 from sb3_hds.twins.mujoco.rigid_body.dynamics import frames_of
-from sb3_hds.twins.mujoco.rigid_body.quaternions import normalized, turn_between, turned
 
-# Largest distance of initial positions from the model's [rad] or [m].
-_NEAR_START = 0.1
 _UNLIMITED = (-math.inf, math.inf)
 
-#: reward(state, action, next_state, params), and terminated(state, params)
-Reward = Callable[[State, Action, State, Params], Scalar]
-Terminated = Callable[[State, Params], Flag]
 
-
-class MechanismTwin(AnalyticTwin):
+class MechanismTwin(ModelTwin, AnalyticTwin):
     r"""
     A tree of rigid bodies with hinges, slides, ball and free joints, as a model file describes it.
 
@@ -63,9 +43,7 @@ class MechanismTwin(AnalyticTwin):
     Equals MuJoCo's ``Euler``, ``implicitfast`` and ``RK4`` without contacts, active joint limits
     and dry friction. Dry friction is :math:`\tau_c \tanh(v / 0.01)`, taken like damping at the end
     of the step (by ``RK4`` at its beginning, smoothed over the speed that a step can stop): under a
-    load a joint creeps where MuJoCo's sticks. Orientations are quaternions in positions, and
-    rotation vectors in tangents; the velocity of a ball or free joint is MuJoCo's: its rotation in
-    the body's frame.
+    load a joint creeps where MuJoCo's sticks.
 
     Made by ``twins.from_mujoco``.
 
@@ -82,6 +60,7 @@ class MechanismTwin(AnalyticTwin):
     """
 
     name = "MuJoCo"
+    near_start = 0.1
 
     def __init__(
         self,
@@ -102,9 +81,8 @@ class MechanismTwin(AnalyticTwin):
             )
         if not isinstance(mechanism, Mechanism):
             mechanism = Mechanism.from_spec(mechanism)
-        if observe not in ("q", "qv"):
-            raise ParameterError(f"{mechanism.name} can observe 'q' or 'qv', got {observe!r}.")
-        self.mechanism, self.name, self.observed = mechanism, mechanism.name, observe
+        self.mechanism, self.name = mechanism, mechanism.name
+        self.set_task(observe, reward, terminated)
         self.payload = None if payload is None else place_of(mechanism, payload)
         self._declare(named_bodies(mechanism, masses))
         self.actuation = Actuation(mechanism)
@@ -116,7 +94,6 @@ class MechanismTwin(AnalyticTwin):
         self.actuators = tuple(_actuators(mechanism))
         velocities = [Channel(f"{n}_velocity", f"{unit}/s") for n, unit in dof_names(mechanism)]
         self.channels = (*_positions(mechanism), *(velocities if observe == "qv" else ()))
-        self._reward, self._terminated = reward, terminated
         self.integrator = rk4 if mechanism.integrator == "rk4" else semi_implicit_euler
         self._digest = hashlib.sha1(json.dumps(mechanism.to_spec()).encode()).hexdigest()
         dt = mechanism.timestep if dt is None else dt
@@ -193,84 +170,20 @@ class MechanismTwin(AnalyticTwin):
 
     # --- positions
 
-    def coordinates(self, q: Position) -> Coordinates:
-        """Quaternions become rotation vectors from the reference."""
-        return self._between(q, self._reference(q)) if self._curved else q
-
-    def displace(self, q: Position, displacement: Velocity) -> Position:
-        if not self._curved:
-            return q + displacement
-        parts = []
-        for link in self.mechanism.links:
-            here, ahead = q[link.straight], displacement[link.v : link.v + len(link.dofs)]
-            parts.append(here + ahead[: len(here)])
-            if link.quaternion:
-                parts.append(turned(q[link.quaternion], ahead[-3:]))
-        return jnp.concatenate(parts)
-
-    def difference(self, state: State, reference: State) -> Tangent:
-        memory = ravel_pytree(state.memory)[0] - ravel_pytree(reference.memory)[0]
-        displacement = self._between(state.q, reference.q)
-        return jnp.concatenate([displacement, state.v - reference.v, memory])
-
-    def retract(self, state: State, tangent: Tangent) -> State:
-        n = self.mechanism.n_v
-        memory, unravel = ravel_pytree(state.memory)
-        q = self.displace(state.q, tangent[:n])
-        return State(q, state.v + tangent[n : 2 * n], unravel(memory + tangent[2 * n :]))
+    @property
+    def quaternions(self) -> tuple[tuple[int, int], ...]:
+        quaternions = [link.quaternion for link in self.mechanism.links if link.quaternion]
+        return tuple((at.start, i) for i, at in enumerate(quaternions))
 
     @property
-    def _curved(self) -> bool:
-        return self.mechanism.n_q != self.mechanism.n_v
-
-    def _between(self, q: Position, reference: Position) -> Coordinates:
-        if not self._curved:
-            return q - reference
-        parts = []
-        for link in self.mechanism.links:
-            parts.append(q[link.straight] - reference[link.straight])
-            if link.quaternion:
-                parts.append(turn_between(q[link.quaternion], reference[link.quaternion]))
-        return jnp.concatenate(parts)
-
-    def _reference(self, q: Position) -> Position:
-        """All joints at zero, with unit quaternions."""
+    def reference(self) -> Float[np.ndarray, " n_q"]:
         zero = np.zeros(self.mechanism.n_q)
-        for link in self.mechanism.links:
-            if link.quaternion:
-                zero[link.quaternion.start] = 1.0
-        return jnp.asarray(zero, q.dtype)
+        zero[[start for start, _ in self.quaternions]] = 1.0
+        return zero
 
-    # --- measurements
-
-    def initial(self, key: PRNGKeyArray, params: Params) -> State:
-        """At rest, near the model's first keyframe or its reference position."""
-        start, n = jnp.array(self.mechanism.start), self.mechanism.n_v
-        offset = jax.random.uniform(key, (n,), minval=-_NEAR_START, maxval=_NEAR_START)
-        q = self.displace(start, offset.astype(start.dtype))
-        return State(q, jnp.zeros(n, start.dtype), {})
-
-    def infer(self, obs: Obs, params: Params) -> State:
-        n = self.mechanism.n_q
-        q = obs[:n]
-        for link in self.mechanism.links:
-            if at := link.quaternion:
-                q = q.at[at].set(normalized(q[at]))
-        v = obs[n:] if self.observed == "qv" else jnp.zeros(self.mechanism.n_v, obs.dtype)
-        return State(q, v, {})
-
-    def observe(self, state: State, params: Params) -> Obs:
-        return jnp.concatenate([state.q, state.v]) if self.observed == "qv" else state.q
-
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        if self._reward is None:
-            return super().reward(state, action, next_state, params)
-        return self._reward(state, action, next_state, params)
-
-    def terminated(self, state: State, params: Params) -> Flag:
-        if self._terminated is None:
-            return super().terminated(state, params)
-        return self._terminated(state, params)
+    @property
+    def start(self) -> Float[np.ndarray, " n_q"]:
+        return np.array(self.mechanism.start)
 
     def skeleton(self, state: State) -> Float[Array, "capsules 2 3"]:
         """
@@ -347,8 +260,7 @@ class MechanismTwin(AnalyticTwin):
         return {"twin": "MuJoCo", "options": options, "parameters": dict(self.values)}
 
     def structure(self) -> tuple[Any, ...]:
-        own = (self._digest, self.observed, self.payload, self.masses)
-        return (*super().structure(), *own, self._reward, self._terminated)
+        return (*super().structure(), self._digest, self.payload, self.masses)
 
 
 def _actuators(mechanism: Mechanism) -> list[Actuator]:

@@ -4,6 +4,8 @@ import dataclasses
 import textwrap
 from typing import Any
 
+from sb3_hds.data.wording import counted
+
 _WIDTH = 80
 
 
@@ -27,19 +29,13 @@ class Report:
         return not self.problems
 
     def __str__(self) -> str:
-        n = len(self.problems)
-        verdict = "no problem found" if self.ok else f"{n} problem{'s' if n > 1 else ''}"
+        verdict = "no problem found" if self.ok else counted(len(self.problems), "problem")
         paragraphs = [textwrap.fill(f"{self.subject}: {verdict}.", _WIDTH)]
         paragraphs += [_item(f"{i}. ", text) for i, text in enumerate(self.problems, 1)]
         paragraphs += [_item("Note: ", text) for text in self.notes]
         return "\n\n".join(paragraphs)
 
     __repr__ = __str__
-
-
-def counted(n: int, what: str) -> str:
-    """:return: ``"1 episode"``, ``"2 episodes"``"""
-    return f"{n} {what}" if n == 1 else f"{n} {what}s"
 
 
 def name_of(env: Any) -> str:

@@ -7,8 +7,9 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_hds.data.wording import counted
 from sb3_hds.errors import ParameterError
-from sb3_hds.wrappers.checks.report import Report, counted, name_of
+from sb3_hds.wrappers.checks.report import Report, name_of
 from sb3_hds.wrappers.checks.task_sample import (
     Sample,
     explained_by,

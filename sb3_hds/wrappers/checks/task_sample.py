@@ -56,9 +56,7 @@ class Sample(NamedTuple):
 
 
 def sampled(env: gymnasium.Env, n_steps: int, seed: int) -> Sample:
-    """
-    :param seed: of initial states and actions; the action space's own generator is not used
-    """
+    """:param seed: of initial states and actions; the action space's own generator is not used"""
     space = copy.deepcopy(env.action_space)
     space.seed(seed)
     obs, _ = env.reset(seed=seed)

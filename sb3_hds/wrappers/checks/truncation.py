@@ -9,9 +9,10 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
+from sb3_hds.data.wording import counted
 from sb3_hds.errors import ParameterError
 from sb3_hds.wrappers.checks.ends_seen import Seen, ends_of_env, ends_of_vec_env, is_same
-from sb3_hds.wrappers.checks.report import Report, counted, name_of
+from sb3_hds.wrappers.checks.report import Report, name_of
 from sb3_hds.wrappers.episodes import Limit, limits_of, own_limit, step_limit_of
 from sb3_hds.wrappers.vec_env import GymnasiumVecEnv
 

@@ -43,9 +43,7 @@ class CrossQPolicy(GaussianPolicy):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CrossQConfig(SACConfig):
-    """
-    Arguments of CrossQ; ``tau`` and ``target_update_interval`` have no effect.
-    """
+    """Arguments of CrossQ; ``tau`` and ``target_update_interval`` have no effect."""
 
     learning_rate: Rate = 1e-3
     _: KW_ONLY

@@ -248,11 +248,7 @@ class GaussianPolicy(LearningPolicy):
         return tuple(np.asarray(values))
 
     def reset_noise(self, batch_size: int = 1) -> None:
-        """
-        Draw a new noise matrix for each environment, if the policy explores by gSDE.
-
-        :param batch_size: number of environments
-        """
+        """Draw a new noise matrix for each environment, if the policy explores by gSDE."""
         if self.use_sde:
             std = self.get_std()
             drawn = self._rng.standard_normal((batch_size, *std.shape), np.float32)

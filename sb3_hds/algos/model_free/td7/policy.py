@@ -172,9 +172,7 @@ class TD7PolicyConfig(PolicyConfig):
     use_sde: bool = False
 
     def __post_init__(self) -> None:
-        """
-        :raises ValueError: for arguments out of range
-        """
+        """:raises ValueError: for arguments out of range"""
         check_count("n_critics", self.n_critics)
         check_count("embedding_size", self.embedding_size)
 
@@ -209,11 +207,7 @@ class TD7Policy(LearningPolicy):
         self.build(UpdateConfig(**self.parts), 0, jax.devices()[0])
 
     def build(self, config: UpdateConfig, seed: int, device: Any) -> None:
-        """
-        Initialise the networks.
-
-        :param config: of the algorithm; the policy keeps it as ``update_config``
-        """
+        """Initialise the networks; the policy keeps the algorithm's config as ``update_config``."""
         self.update_config = config
         key = jax.random.key(seed, impl=GENERATOR)
         self.agent_state = jax.device_put(init_state(config, self.n_obs, self.n_act, key), device)
@@ -264,6 +258,4 @@ def _q_values(config: UpdateConfig, encoder: Any, critic: Any, obs: Any, actions
     return q_values(config, critic, obs, actions, *embed(config, encoder, obs, actions))
 
 
-@partial(jax.jit, static_argnums=0)
-def _act(config: UpdateConfig, encoder: Any, actor: Any, obs: Any) -> jax.Array:
-    return act(config, encoder, actor, obs)
+_act = jax.jit(act, static_argnums=0)

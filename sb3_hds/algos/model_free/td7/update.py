@@ -203,9 +203,7 @@ def loss_of(config: UpdateConfig, error: Float[Array, "critics batch"]) -> Float
 
 
 class _Report(NamedTuple):
-    """
-    :param priority: of the batch's transitions
-    """
+    """:param priority: of the batch's transitions"""
 
     metrics: UpdateMetrics
     priority: Float[Array, " batch"]

@@ -3,29 +3,20 @@
 import base64
 import dataclasses
 import zlib
-from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Float
 
-from sb3_hds.core import Actuator, Channel, Joint, State
-from sb3_hds.core.types import Action, Flag, Obs, Params, Scalar
+from sb3_hds.core import Actuator, Channel, Joint
 from sb3_hds.errors import ModelFileError, ParameterError
 from sb3_hds.twins.mujoco.engine.twin import EngineTwin, Source
 from sb3_hds.twins.mujoco.engine.values import actuator_name, declared, natives
 from sb3_hds.twins.mujoco.library import mujoco
-from sb3_hds.twins.mujoco.rigid_body.quaternions import normalized
-
-_NEAR_START = 0.05  # half width of random initial positions [rad] or [m]
-
-Reward = Callable[[State, Action, State, Params], Scalar]
-Terminated = Callable[[State, Params], Flag]
+from sb3_hds.twins.mujoco.model_twin import ModelTwin, Reward, Terminated
 
 
-class ContactTwin(EngineTwin):
+class ContactTwin(ModelTwin, EngineTwin):
     """
     A model of MuJoCo with contacts. Made by ``twins.from_mujoco(model, engine="mujoco")``.
 
@@ -41,6 +32,7 @@ class ContactTwin(EngineTwin):
     """
 
     name = "MuJoCoEngine"
+    near_start = 0.05
 
     def __init__(
         self,
@@ -57,10 +49,8 @@ class ContactTwin(EngineTwin):
             raise ParameterError(
                 "A twin of this kind needs a model: twins.from_mujoco(path, engine='mujoco')."
             )
-        if observe not in ("q", "qv"):
-            raise ParameterError(f"observe must be 'q' or 'qv', got {observe!r}.")
         self._source = Compiled.from_spec(model) if isinstance(model, str) else Compiled.of(model)
-        self.observed, self._reward, self._terminated = observe, reward, terminated
+        self.set_task(observe, reward, terminated)
         read = self.model
         _check(read)
         mj = mujoco()
@@ -112,35 +102,9 @@ class ContactTwin(EngineTwin):
     def source(self) -> Source:
         return self._source
 
-    def structure(self) -> tuple[Any, ...]:
-        return (*super().structure(), self.observed, self._reward, self._terminated)
-
-    def initial(self, key: PRNGKeyArray, params: Params) -> State:
-        """At rest, near the model's first keyframe or its reference position."""
-        start, n = self.model.key_qpos[0] if self.model.nkey else self.model.qpos0, len(self.joints)
-        offset = jax.random.uniform(key, (n,), minval=-_NEAR_START, maxval=_NEAR_START)
-        return State(self._displace(jnp.array(start), offset), jnp.zeros(n), {})
-
-    def infer(self, obs: Obs, params: Params) -> State:
-        n = self.model.nq
-        q = obs[:n]
-        for at, _ in self.quaternions:
-            q = q.at[at : at + 4].set(normalized(q[at : at + 4]))
-        v = obs[n:] if self.observed == "qv" else jnp.zeros(len(self.joints), obs.dtype)
-        return State(q, v, {})
-
-    def observe(self, state: State, params: Params) -> Obs:
-        return jnp.concatenate([state.q, state.v]) if self.observed == "qv" else state.q
-
-    def reward(self, state: State, action: Action, next_state: State, params: Params) -> Scalar:
-        if self._reward is None:
-            return super().reward(state, action, next_state, params)
-        return self._reward(state, action, next_state, params)
-
-    def terminated(self, state: State, params: Params) -> Flag:
-        if self._terminated is None:
-            return super().terminated(state, params)
-        return self._terminated(state, params)
+    @property
+    def start(self) -> Float[np.ndarray, " n_q"]:
+        return self.model.key_qpos[0] if self.model.nkey else self.model.qpos0
 
     def to_spec(self) -> dict[str, Any]:
         """

@@ -48,10 +48,7 @@ class Layout(NamedTuple):
         return self.nq + self.nv + self.n_readings
 
     def n_columns(self, more: bool) -> int:
-        """
-        :param more: whether applied forces and parameters are among the directions
-        :return: number of directions of a linearisation
-        """
+        """:return: directions of a linearisation, with applied forces and parameters or without"""
         return 2 * self.nv + self.nu + (self.nv + self.n_values if more else 0)
 
 

@@ -9,26 +9,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from sb3_hds.core import NO_EFFECTS, EffectChain, Moment, State, Twin
+from sb3_hds.core import NO_EFFECTS, EffectChain, Moment, State
 from sb3_hds.core.types import (
     Action,
-    Coordinates,
     Force,
     MassMatrix,
     Memory,
     Params,
     Position,
-    Tangent,
     Velocity,
 )
 from sb3_hds.twins.mujoco.engine.host import Function, on_host
 from sb3_hds.twins.mujoco.engine.simulator import Reading, Simulator
 from sb3_hds.twins.mujoco.engine.values import Values
 from sb3_hds.twins.mujoco.library import mujoco
-from sb3_hds.twins.mujoco.rigid_body.quaternions import turn_between, turned, turning
+from sb3_hds.twins.mujoco.model_twin import QuaternionTwin
+from sb3_hds.twins.mujoco.rigid_body.quaternions import turning
 
 # Key of a state's memory under which readings of the engine are.
 _READ = "read"
@@ -42,7 +40,7 @@ class Source(abc.ABC):
         """:return: the compiled model, an ``MjModel``"""
 
 
-class EngineTwin(Twin):
+class EngineTwin(QuaternionTwin):
     r"""
     Abstract: MuJoCo's C engine, with contacts, limits and tendons, as a twin.
 
@@ -65,6 +63,8 @@ class EngineTwin(Twin):
     :meth:`source`.
     """
 
+    differentiability = "differences"
+
     @abc.abstractmethod
     def source(self) -> Source:
         """:return: where the nominal model comes from"""
@@ -83,8 +83,11 @@ class EngineTwin(Twin):
 
     @property
     def quaternions(self) -> tuple[tuple[int, int], ...]:
-        """Index of each quaternion in positions, and how much lower it is in velocities."""
         return _quaternions(self.source())
+
+    @property
+    def reference(self) -> Float[np.ndarray, " n_q"]:
+        return self.model.qpos0
 
     def structure(self) -> tuple[Any, ...]:
         return (*super().structure(), self.source())
@@ -116,7 +119,7 @@ class EngineTwin(Twin):
                 terms = (load, matrix) if with_load else effects.load(lambda: load, lambda: matrix)
                 return Moment(self.coordinates(q), v, actuator, *terms, h)
 
-            held, middle = effects.held(moment, state.q, state.v, memory, h, self._displace)
+            held, middle = effects.held(moment, state.q, state.v, memory, h, self.displace)
             force = held + effects.force(moment(state.q, state.v), memory)
             after = self._after(last, here._replace(force=force), memory)
             memory = effects.advance(middle, moment(after.q, after.v), after.memory)
@@ -169,44 +172,9 @@ class EngineTwin(Twin):
         read = jnp.concatenate([readings[name] for name in self.readings()])
         return state._replace(memory=state.memory | {_READ: read.astype(state.q.dtype)})
 
-    # --- positions
-
-    def coordinates(self, q: Position) -> Coordinates:
-        """Quaternions become rotation vectors from the reference position."""
-        if not self.quaternions:
-            return q
-        return self._between(q, jnp.asarray(self.model.qpos0, q.dtype))
-
-    def difference(self, state: State, reference: State) -> Tangent:
-        """The tangent vector, without readings."""
-        memory = ravel_pytree(_kept(state))[0] - ravel_pytree(_kept(reference))[0]
-        moved = self._between(state.q, reference.q)
-        return jnp.concatenate([moved, state.v - reference.v, memory.astype(moved.dtype)])
-
-    def retract(self, state: State, tangent: Tangent) -> State:
-        n = len(state.v)
-        memory, unravel = ravel_pytree(_kept(state))
-        moved = unravel(memory + tangent[2 * n :].astype(memory.dtype))
-        q = self._displace(state.q, tangent[:n])
-        return State(q, state.v + tangent[n : 2 * n], state.memory | moved)
-
-    def _displace(self, q: Position, displacement: Velocity) -> Position:
-        parts, at = [], 0
-        for start, shift in self.quaternions:
-            parts.append(q[at:start] + displacement[at - shift : start - shift])
-            turn = displacement[start - shift : start - shift + 3]
-            parts.append(turned(q[start : start + 4], turn))
-            at = start + 4
-        parts.append(q[at:] + displacement[at - len(self.quaternions) :])
-        return jnp.concatenate(parts)
-
-    def _between(self, q: Position, reference: Position) -> Coordinates:
-        parts, at = [], 0
-        for start, _ in self.quaternions:
-            parts.append(q[at:start] - reference[at:start])
-            parts.append(turn_between(q[start : start + 4], reference[start : start + 4]))
-            at = start + 4
-        return jnp.concatenate([*parts, q[at:] - reference[at:]])
+    def kept(self, state: State) -> dict[str, Memory]:
+        """:return: the memory without readings"""
+        return {name: memory for name, memory in state.memory.items() if name != _READ}
 
 
 class _Row(NamedTuple):
@@ -239,11 +207,6 @@ class _Interval(NamedTuple):
 
     def __call__(self, row: _Row) -> tuple[Position, Velocity, Memory]:
         return self.call(row)
-
-
-def _kept(state: State) -> dict[str, Memory]:
-    """The memory without readings."""
-    return {name: memory for name, memory in state.memory.items() if name != _READ}
 
 
 @functools.lru_cache(maxsize=16)
