@@ -1,7 +1,7 @@
 """Subset selection: a local search over sets of causes, confirmed on held-out data."""
 
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
@@ -125,26 +125,33 @@ def _climb(p: Problem, keys: list[int], barred: Collection[int] = ()) -> tuple[f
 
 def _add_or_drop(p: Problem, keys: list[int]) -> list[list[int]]:
     families = {p.family(i) for i in keys}
-    open_to = _best_of_each(p, [i for i in p.ranking(keys) if p.family(i) not in families])
+    open_to = [i for i in p.ranking(keys) if p.family(i) not in families]
+    added = itertools.islice(_best_of_each(p, keys, open_to), _ADDED)
     dropped = [[m for m in keys if m != i] for i in keys if i not in p.always]
-    return [[*keys, i] for i in open_to[:_ADDED]] + dropped
+    return [*added, *dropped]
 
 
 def _swap(p: Problem, keys: list[int]) -> list[list[int]]:
     trials = []
     for i in (i for i in keys if i not in p.always):
         rest = [m for m in keys if m != i]
-        others = _best_of_each(p, p.ranking(rest, substitutes(p, keys, i)))
-        trials += [[*rest, o] for o in others[:_SWAPPED]]
+        others = p.ranking(rest, substitutes(p, keys, i))
+        trials += itertools.islice(_best_of_each(p, rest, others), _SWAPPED)
     return trials
 
 
-def _best_of_each(p: Problem, ranked: Sequence[int]) -> list[int]:
-    """:return: of items of the same candidate, which differ in nonlinear parameters, the first"""
-    best: dict[str, int] = {}
+def _best_of_each(p: Problem, keys: list[int], ranked: Sequence[int]) -> Iterator[list[int]]:
+    """
+    :param ranked: items to add, the best first
+    :return: sets with one more: of items of the same candidate, which differ in nonlinear
+        parameters, with the first that is admissible
+    """
+    done: set[str] = set()
     for i in ranked:
-        best.setdefault(p.items[i].key, i)
-    return [*best.values()]
+        item, more = p.items[i], [*keys, i]
+        if item.key not in done and (not item.settings or np.isfinite(p.score(more))):
+            done.add(item.key)
+            yield more
 
 
 def _one_for_two(p: Problem, keys: list[int]) -> list[list[int]]:
