@@ -33,7 +33,13 @@ def retune(p: Problem, keys: list[int]) -> list[int]:
         if p.items[i].settings and i not in p.always:
             same = [o for o, item in enumerate(p.items) if item.key == p.items[i].key]
             trials = [[*keys[:place], o, *keys[place + 1 :]] for o in same]
-            keys = min(trials, key=lambda t: (t[place] in p.out_of_bounds(t), p.solve(t).rss))
+            keys = min(
+                trials,
+                key=lambda t: (
+                    t[place] in p.out_of_bounds(t) or not p.leaves_commands(t),
+                    p.solve(t).rss,
+                ),
+            )
     return keys
 
 

@@ -20,6 +20,8 @@ _BEYOND_NODE = 0.1
 # Variance inflation of a coefficient beyond which columns count as collinear: 1 / (1 - R^2), where
 # the others explain 99.5 % of its column.
 _MOST_INFLATION = 200.0
+# Least share of the commands that a dead zone and a saturation together let pass.
+_LEAST_PASSED = 0.1
 # Least share of the logged command or the inertia that counts as left by a set.
 _LEAST_LEFT = 0.02
 # Least ratio of sliding to static friction: a steeper drop stands for a curve of another form.
@@ -238,7 +240,7 @@ class Problem:
         """Whether all members are inside their bounds, not collinear, and leave some command."""
         if not np.isfinite(found.rss):
             return False
-        if min(self._passed(keys).values(), default=1.0) <= 0.0:
+        if not self.leaves_commands(keys):
             return False
         if found.free and self._inflation(found.free, found.inverse).max() > _MOST_INFLATION:
             return False
@@ -318,6 +320,10 @@ class Problem:
                 change = value.get(item.columns[0], 0.0) * self.drives[item.key]
                 out += 2.0 * np.minimum(0.0, np.log(np.maximum(1.0 + change, _LEAST_LEFT)))
         return out + np.minimum(0.0, self._change_of_noise(keys, value))
+
+    def leaves_commands(self, keys: Sequence[int]) -> bool:
+        """Whether a dead zone and a saturation of one actuator together pass some commands."""
+        return min(self._passed(keys).values(), default=1.0) >= _LEAST_PASSED
 
     def _passed(self, keys: Sequence[int]) -> dict[tuple[int, ...], float]:
         """

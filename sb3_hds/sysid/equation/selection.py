@@ -21,6 +21,8 @@ from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Moves that are tried from each set: best additions, best substitutes of a member, and rounds.
 _ADDED, _SWAPPED, _MOST_MOVES = 12, 5, 80
+# Rounds of removing what is not confirmed.
+_MOST_ROUNDS = 4
 # Best causes in place of two, and how many of such sets are tried with new nonlinear parameters.
 _FOR_TWO, _RETUNED = 2, 3
 # Rarity from which members are retried without, and how many.
@@ -51,13 +53,31 @@ def propose(problem: Problem) -> tuple[list[int], list[int]]:
     _, keys = min((_climb(problem, start) for start in _starts(problem)), key=lambda r: r[0])
     keys = _try_shared(problem, keys)
     keys = _retry_without_doubtful(problem, keys)
-    keys = _with_plausible(problem, keys)
-    while True:
-        keys = _simplify(problem, _drop_unconfirmed(problem, keys))
-        preferred = _prefer_plausible(problem, keys)
-        if preferred == keys:
-            return _split_hints(problem, keys)
-        keys = preferred
+    return _split_hints(problem, _confirmed(problem, _with_plausible(problem, keys)))
+
+
+def _confirmed(p: Problem, keys: list[int]) -> list[int]:
+    """
+    Remove what held-out data do not confirm, and climb again without it: what it stood for may be
+    something else.
+    """
+    barred: set[int] = set()
+    best: list[int] | None = None
+    for _ in range(_MOST_ROUNDS):
+        kept = _simplify(p, _drop_unconfirmed(p, keys))
+        while (preferred := _prefer_plausible(p, kept)) != kept:
+            kept = _simplify(p, _drop_unconfirmed(p, preferred))
+        if best is not None and p.score(kept) >= p.score(best) - 1e-6:
+            return best
+        best = kept
+        families = {p.family(i) for i in keys} - {p.family(i) for i in kept}
+        barred |= {i for i in range(len(p.items)) if p.family(i) in families}
+        _, keys = _climb(p, kept, barred)
+        keys = _simplify(p, _drop_negligible(p, keys))
+        if {*keys} <= {*kept}:
+            break
+    assert best is not None
+    return best
 
 
 def _with_plausible(p: Problem, keys: list[int]) -> list[int]:
