@@ -44,6 +44,8 @@ from independent_rigs import (
     can_change,
 )
 
+from sb3_hds.sysid.equation.regression import squares
+
 SEVERAL = "several"
 #: cards: what closes the loop, what is recorded, and how many recordings the same steps make
 LOOPS = ("open", "open", "position", "open", "open", "velocity")
@@ -399,7 +401,7 @@ def visible(screened: Any, truths: Sequence[str]) -> list[bool]:
             chosen[key] = min(trials, key=lambda i: p.solve([*p.always, *trials[i]]).rss)
 
     def left(items: Sequence[int]) -> float:
-        rss = p.by_joint(p.solve([*p.always, *items]).weights, p.grams.by_joint)
+        rss = squares(p.solve([*p.always, *items]).weights, p.grams.by_joint)
         n = p.grams.n_effective
         return float(np.sum(n * np.log(np.maximum(rss, 1e-9) / n)))
 

@@ -76,8 +76,7 @@ class Twin(abc.ABC):
     channels: tuple[Channel, ...]
     parameters: Mapping[str, Parameter]
     max_episode_steps: int | None = None
-    #: ``"reverse"`` if reverse mode works, too; ``"forward"`` if only forward mode does;
-    #: ``"differences"`` if both do, but a column costs a step: identification would take hours
+    #: ``"reverse"``; ``"forward"``: only forward mode; ``"differences"``: a column costs a step
     differentiability: str = "reverse"
     #: False if the reward is flat almost everywhere: then override ``planning_reward``
     reward_has_gradient: bool = True
@@ -163,10 +162,7 @@ class Twin(abc.ABC):
         return changed
 
     def freed(self, names: Collection[str] | None = None) -> "Twin":
-        """
-        :param names: of parameters that are constants of this twin; default: all that may be freed
-        :return: the same system, with these constants as parameters, such as the masses of bodies
-        """
+        """:return: the same system, with constants such as masses as parameters: these, or all"""
         return self
 
     def extend(self, *effects: Effect) -> "Twin":

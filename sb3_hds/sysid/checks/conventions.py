@@ -14,6 +14,7 @@ from sb3_hds.core import AnalyticTwin, Twin
 from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ConstantForce, CoulombFriction, ViscousFriction
 from sb3_hds.sysid.equation.assembly import assemble, normal_problem
+from sb3_hds.sysid.equation.regression import squares
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.motion.motion import JointMotion, Motion
 
@@ -136,7 +137,7 @@ def _residual(hypotheses: Hypotheses, motion: Motion) -> tuple[np.ndarray, np.nd
     p = normal_problem(hypotheses, made)
     keys = list(range(len(p.items)))
     found = p.solve(keys)
-    rss = p.by_joint(found.weights, p.grams.by_joint)
+    rss = squares(found.weights, p.grams.by_joint)
     floor = np.where(p.grams.floor > 0.0, p.grams.floor, 1.0)
     return p.grams.n_effective, np.sqrt(rss / p.grams.n_effective) / floor
 

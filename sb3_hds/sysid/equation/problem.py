@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sb3_hds.sysid.equation.plausibility import plausibility
-from sb3_hds.sysid.equation.regression import Item, Solution, least_squares
+from sb3_hds.sysid.equation.regression import Item, Solution, least_squares, squares
 from sb3_hds.sysid.equation.weak_form import Grams
 from sb3_hds.sysid.estimation.candidates import PARAMETER
 
@@ -238,9 +238,7 @@ class Problem:
 
     def admissible(self, keys: Sequence[int], found: Solution) -> bool:
         """Whether all members are inside their bounds, not collinear, and leave some command."""
-        if not np.isfinite(found.rss):
-            return False
-        if not self.leaves_commands(keys):
+        if not np.isfinite(found.rss) or not self.leaves_commands(keys):
             return False
         if found.free and self._inflation(found.free, found.inverse).max() > _MOST_INFLATION:
             return False
@@ -278,7 +276,7 @@ class Problem:
         found = self.solve(keys)
         if not self.admissible(keys, found):
             return np.inf
-        rss = self.by_joint(self._with_measured_accelerations(found.weights), self.grams.by_joint)
+        rss = squares(self._with_measured_accelerations(found.weights), self.grams.by_joint)
         n = self.grams.n_effective
         left = np.log(np.maximum(rss, 1e-9) / n) - self.lost_excitation(keys, found)
         prior = float(np.sum(self.prior[found.free] * found.theta**2))
@@ -293,11 +291,6 @@ class Problem:
         smooth, noisy, judged = list(self.noisy), list(self.noisy.values()), weights.copy()
         judged[noisy], judged[smooth] = weights[smooth], 0.0
         return judged
-
-    @staticmethod
-    def by_joint(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
-        on = np.flatnonzero(weights)
-        return np.einsum("i,...ik,k->...", weights[on], gram[..., on[:, None], on], weights[on])
 
     def lost_excitation(self, keys: Sequence[int], found: Solution) -> np.ndarray:
         """
@@ -326,10 +319,7 @@ class Problem:
         return min(self._passed(keys).values(), default=1.0) >= _LEAST_PASSED
 
     def _passed(self, keys: Sequence[int]) -> dict[tuple[int, ...], float]:
-        """
-        :return: by joints, the share of commands that a dead zone, which lets the large ones pass,
-            and a saturation, which lets the small ones pass, leave together
-        """
+        """By joints, the share of commands that a dead zone and a saturation let pass together."""
         found: dict[tuple[int, ...], float] = {}
         for i in (i for i in keys if i in self.passes):
             place = tuple(map(int, self.joints(i)))
@@ -362,7 +352,7 @@ class Problem:
         out = []
         for fold, beside in zip(self.grams.folds, self._beside, strict=True):
             found = self.solve(keys, beside)
-            rss = self.by_joint(self._with_measured_accelerations(found.weights), fold)
+            rss = squares(self._with_measured_accelerations(found.weights), fold)
             taken = np.maximum(self.lost_excitation(keys, found), -6.0)
             out.append(rss * np.exp(-taken))
         return np.array(out)

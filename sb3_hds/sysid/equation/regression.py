@@ -70,6 +70,16 @@ def least_squares(
     return theta, inverse / np.outer(size, size)
 
 
+def squares(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
+    """
+    :param weights: of the columns, shape ``(columns,)``
+    :param gram: normal equations, shape ``(..., columns, columns)``
+    :return: sums of squares of the weighted columns' sum, shape ``(...)``
+    """
+    on = np.flatnonzero(weights)
+    return np.einsum("i,...ik,k->...", weights[on], gram[..., on[:, None], on], weights[on])
+
+
 @dataclasses.dataclass(frozen=True)
 class Item:
     """

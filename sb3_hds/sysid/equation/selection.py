@@ -21,8 +21,8 @@ from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Moves that are tried from each set: best additions, best substitutes of a member, and rounds.
 _ADDED, _SWAPPED, _MOST_MOVES = 12, 5, 80
-# Rounds of removing what is not confirmed.
-_MOST_ROUNDS = 4
+# Rounds of climbing again without what was not confirmed.
+_MOST_ROUNDS = 3
 # Best causes in place of two, and how many of such sets are tried with new nonlinear parameters.
 _FOR_TWO, _RETUNED = 2, 3
 # Rarity from which members are retried without, and how many.
@@ -62,22 +62,24 @@ def _confirmed(p: Problem, keys: list[int]) -> list[int]:
     something else.
     """
     barred: set[int] = set()
-    best: list[int] | None = None
+    best = _only_confirmed(p, keys)
     for _ in range(_MOST_ROUNDS):
-        kept = _simplify(p, _drop_unconfirmed(p, keys))
-        while (preferred := _prefer_plausible(p, kept)) != kept:
-            kept = _simplify(p, _drop_unconfirmed(p, preferred))
-        if best is not None and p.score(kept) >= p.score(best) - 1e-6:
-            return best
-        best = kept
-        families = {p.family(i) for i in keys} - {p.family(i) for i in kept}
+        families = {p.family(i) for i in keys} - {p.family(i) for i in best}
         barred |= {i for i in range(len(p.items)) if p.family(i) in families}
-        _, keys = _climb(p, kept, barred)
+        _, keys = _climb(p, best, barred)
         keys = _simplify(p, _drop_negligible(p, keys))
-        if {*keys} <= {*kept}:
+        new = _only_confirmed(p, keys)
+        if p.score(new) >= p.score(best) - 1e-6:
             break
-    assert best is not None
+        best = new
     return best
+
+
+def _only_confirmed(p: Problem, keys: list[int]) -> list[int]:
+    kept = _simplify(p, _drop_unconfirmed(p, keys))
+    while (preferred := _prefer_plausible(p, kept)) != kept:
+        kept = _simplify(p, _drop_unconfirmed(p, preferred))
+    return kept
 
 
 def _with_plausible(p: Problem, keys: list[int]) -> list[int]:
