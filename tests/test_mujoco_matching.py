@@ -176,3 +176,12 @@ def test_data_are_put_into_the_order_of_the_twin():
     np.testing.assert_array_equal(ordered.actions[0, 0], [1.0, 2.0, 3.0])
     with pytest.raises(TrajectoryError, match="do not carry the names of their columns"):
         arranged(arm(), data)
+
+
+def test_currents_in_the_place_of_torques_are_remarked():
+    forms = ["{}_position", "{}_velocity", "{}_current"]
+    found = match(arm(), [form.format(name) for form in forms for name in NAMES])
+
+    (sentence,) = found.remarks
+    assert "shoulder_pan_joint_current, " in sentence and "[N m/A] as 'scale'" in sentence
+    assert not match(arm(), [f"{name}_{x}" for x in ("pos", "vel", "tau") for name in NAMES]).remarks

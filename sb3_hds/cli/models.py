@@ -23,6 +23,7 @@ OPTIONS = ("actuators", "ignore", "lock")
 _STILL = 0.005
 # Behind names of columns that are known to be commands.
 _COMMAND = " command"
+_SCALED = "a current: add the torque constant times the gear ratio [N m/A] as scale"
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
@@ -151,7 +152,7 @@ def _loaded(
             f"may be left out), and pass it with --columns:\n\n{_map_of(twin, found, named)}"
         )
     data = load(named.chosen(map(str, found.obs), _commands(found, named)))
-    for sentence in (*named.guessed, *filter(None, [found.renamed])):
+    for sentence in (*named.guessed, *found.remarks):
         print(sentence)
     _check_locked(load, twin, found, named)
     return data
@@ -232,12 +233,13 @@ def _map_of(twin: "MechanismTwin", found: "Matching", named: "ChannelCandidates"
     """A map of columns for a twin: what was found by name, and guesses."""
     from sb3_hds.data.overview import Suggestion, suggested_map
     from sb3_hds.data.wording import listed
+    from sb3_hds.twins.mujoco.names.words import is_current
 
     near = dict(found.missing)
 
     def line(name: str, column: str, missing: str, placed: str) -> Suggestion:
         if column:
-            return Suggestion(name, column)
+            return Suggestion(name, column, _SCALED if is_current(column) else "")
         options = [option.removesuffix(_COMMAND) for option in near.get(missing, ())]
         if len(options) == 1:
             return Suggestion(name, options[0], "a guess")

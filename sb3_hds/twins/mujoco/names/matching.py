@@ -17,6 +17,7 @@ from sb3_hds.twins.mujoco.names.words import (
     VELOCITY,
     Parsed,
     Signal,
+    is_current,
     tokens,
 )
 from sb3_hds.twins.mujoco.twin import MechanismTwin
@@ -56,6 +57,17 @@ class Matching:
             "obs": [{"column": str(name)} for name in self.obs],
             "actions": [{"column": str(name)} for name in self.actions],
         }
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on what a user should check."""
+        currents = [name for name in self.actions if name and is_current(name)]
+        scale = (
+            f"By their names, {', '.join(currents)} are motor currents, where the model has "
+            "torques. Give the torque constant times the gear ratio [N m/A] as 'scale' in the map "
+            "of columns, unless it is in them."
+        )
+        return tuple(filter(None, [self.renamed, scale if currents else ""]))
 
     def check(self) -> None:
         """:raises TrajectoryError: if anything is missing, with the nearest names"""
@@ -194,8 +206,8 @@ def arranged(twin: MechanismTwin, data: Trajectories) -> Trajectories:
     actions = [f"{name} command" for name in report.actions]
     found = match(twin, [*report.obs, *actions])
     found.check()
-    if found.renamed:
-        warnings.warn(found.renamed, stacklevel=2)
+    for sentence in found.remarks:
+        warnings.warn(sentence, stacklevel=2)
     obs_at = [report.obs.index(str(name)) for name in found.obs]
     actions_at = [actions.index(str(name)) for name in found.actions]
     return dataclasses.replace(

@@ -69,3 +69,8 @@ class Parsed:
 def tokens(name: str) -> list[str]:
     """:return: words and numbers of a name, in lower case"""
     return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
+
+
+def is_current(name: str) -> bool:
+    """:return: whether a column of an effort has the name of a motor current [A]"""
+    return "current" in tokens(name)
