@@ -323,6 +323,47 @@ def test_other_conventions_of_a_log_are_reported_before_any_cause(given, name):
     assert (found and found.key.partition(".")[0]) == name
 
 
+@pytest.fixture(scope="module")
+def swinging_arm():
+    """An arm of three joints with more friction than its model, and a log of it."""
+    limits = {"range": "-6 6", "damping": "0.6", "frictionloss": "0"}
+    model = robots.chain(3, actuator="none", **limits)
+    options = {"actuators": {"kind": "torque", "limit": {"j0": 3.0, "j1": 6.0, "j2": 2.0}}}
+    nominal = twins.from_mujoco(model, dt=0.01, ignore="limits", **options)
+    rubbing = [effects.CoulombFriction(f"j{i}", tau_c=tau) for i, tau in enumerate((0.2, 0.3, 0.1))]
+    real = nominal.at_interval(0.01, 10).extend(*rubbing)
+    return nominal, measured(real, n=4, n_steps=400, noise=1e-4)
+
+
+def rewritten(data, obs=1.0, actions=1.0, order=(0, 1, 2)):
+    columns = [*order, *(3 + i for i in order)]
+    return Trajectories.from_arrays(
+        (data.obs * np.asarray(obs))[:, :, columns], data.actions * np.asarray(actions), dt=data.dt
+    )
+
+
+@pytest.mark.parametrize(
+    ("written", "believed", "keys", "words"),
+    [
+        ({}, {}, None, ""),
+        ({"obs": [1, -1, -1, 1, -1, -1]}, {}, {"direction.j1.j2"}, "scale: -1"),
+        ({"order": (0, 2, 1), "actions": [1, 1, -1]}, {}, {"order.j1.j2", "command.j2"}, "in the"),
+        ({}, {"tilt_x": np.pi / 2}, {"mounting"}, "--set tilt_x:0.0000 tilt_y:0.0000"),
+        ({"actions": 1 / 8.0}, {}, {"torque.j0.j1.j2"}, "7.43, 7.64, 7.32"),
+        ({"obs": [1, 60, 1, 1, 60, 1]}, {}, {"gear.j1"}, "about 60"),
+        ({"obs": [1, 60, 40, 1, 60, 40]}, {}, {"gear.j1.j2"}, "the motor"),
+    ],
+)
+def test_what_else_an_arm_may_be_counted_in(swinging_arm, written, believed, keys, words):
+    nominal, data = swinging_arm
+    twin, log = nominal.with_parameters(**believed), rewritten(data, **written)
+
+    found = other_convention(twin, smoothed_motion(twin, log), ())
+
+    assert (found and {*found.key.split("+")}) == keys
+    assert found is None or words in found.words
+
+
 def test_velocities_are_compared_with_differences_of_positions():
     rng, dt = np.random.default_rng(0), 0.01
     recordings = []

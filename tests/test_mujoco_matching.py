@@ -184,4 +184,6 @@ def test_currents_in_the_place_of_torques_are_remarked():
 
     (sentence,) = found.remarks
     assert "shoulder_pan_joint_current, " in sentence and "[N m/A] as 'scale'" in sentence
-    assert not match(arm(), [f"{name}_{x}" for x in ("pos", "vel", "tau") for name in NAMES]).remarks
+    assert not match(
+        arm(), [f"{name}_{x}" for x in ("pos", "vel", "tau") for name in NAMES]
+    ).remarks

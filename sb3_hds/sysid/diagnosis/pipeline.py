@@ -232,10 +232,7 @@ class Inquiry:
             verdict="unknown",
             believed=self.nominal,
             convention=convention.key,
-            unexplained=(
-                f"{convention.words} The equation of motion then leaves {convention.after:.1f} "
-                f"times the noise, not {convention.before:.0f} times. No cause was looked for."
-            ),
+            unexplained=f"{convention.words} No cause was looked for.",
             caveats=(*map(str, self.given.audit.findings), *self.given.corrected),
             twin=self.nominal,
             data_hash=self.data_hash,

@@ -35,6 +35,8 @@ _LEAST_LATE = 0.03
 _BEYOND = 0.5
 # Masses and lengths may be off by these factors.
 _LEAST_OF_IT, _MOST_OF_IT = 0.1, 5.0
+# Angles may be off by this much [rad]: columns are derivatives.
+_MOST_TURNED = 1.0
 # Least noise of a velocity, in shares of the fastest joint's speed.
 _QUIETEST = 1e-6
 
@@ -228,6 +230,8 @@ def _bounds(h: Hypotheses, item: Item, name: str) -> tuple[float, float]:
         value, low, high = h.nominal.values[place], h.lower[i], h.upper[i]
         if item.candidate.index >= 0 and low > 0.0:
             low, high = max(low, _LEAST_OF_IT * value), min(high, _MOST_OF_IT * value)
+        if h.nominal.parameters[place].unit == "rad":
+            low, high = max(low, value - _MOST_TURNED), min(high, value + _MOST_TURNED)
         return low - value, high - value
     full = next(p for p in item.candidate.parameters if p.rpartition(".")[2] == name)
     i = h.names.index(full)

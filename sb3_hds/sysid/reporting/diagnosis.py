@@ -71,9 +71,10 @@ class Diagnosis:
     :param seed: of the split and all other random choices
     :param findings: causes, in the order in which they were found
     :param unexplained: residual that they do not explain, in words; empty if there is none
-    :param convention: which convention of the model the log does not follow (``"zero"``,
-        ``"direction"``, ``"command"``, ``"degrees"`` or ``"order"``, and where:
-        ``"direction.hinge"``), or empty; ``unexplained`` says what to write
+    :param convention: which conventions of the model the log does not follow (``"zero"``,
+        ``"direction"``, ``"command"``, ``"degrees"``, ``"order"``, ``"mounting"``, ``"torque"``
+        or ``"gear"``, and where: ``"direction.hinge"``), with a ``"+"`` between several, or empty;
+        ``unexplained`` says what to write
     :param gain: by horizon in steps
     :param explained: share of the predictable residual force that the findings explain, or 0
     :param detectable: by effect and place, the smallest size that these data would have shown, to

@@ -56,7 +56,7 @@ def of_plant(
     :return: the parameters of the equation of motion
     """
     forces = usual.weight + _OF_DRIVE * usual.drive
-    found = {name: Parameter(0.0, _TILT, "rad", -1.0, 1.0) for name in tilts(mechanism)}
+    found = {name: Parameter(0.0, _TILT, "rad", -np.pi, np.pi) for name in tilts(mechanism)}
     for link in mechanism.links:
         found |= _of_link(link, usual.inertia, forces)
     moving = [link.body for link in mechanism.links if link.body]
