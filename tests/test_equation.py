@@ -323,6 +323,37 @@ def test_other_conventions_of_a_log_are_reported_before_any_cause(given, name):
     assert (found and found.key.partition(".")[0]) == name
 
 
+def shaken_axis(late):
+    """Two recordings of a mass of 2 kg, shaken at about 1 Hz by commands that are late [s]."""
+    obs, actions, fine = [], [], 1e-3
+    for phase in (0.0, 2.0):
+
+        def pull(t, phase=phase):
+            return sum(
+                6.0 * np.sin(2.0 * np.pi * f * t + k * phase)
+                for k, f in ((1, 0.9), (2, 1.0), (3, 1.1))
+            )
+
+        t = fine * np.arange(12_001)
+        v = np.cumsum(pull(t - late)) * fine / 2.0
+        q = np.cumsum(v) * fine
+        obs.append(np.stack([q, v], 1)[::10])
+        actions.append(pull(t[:-1:10])[:, None])
+    return twins.make("LinearAxis", mass=2.0, dt=0.01), Trajectories.from_arrays(
+        obs, actions, dt=0.01
+    )
+
+
+def test_commands_that_are_late_by_half_a_period_have_no_wrong_sign():
+    twin, data = shaken_axis(late=0.0)
+    turned = Trajectories.from_arrays(data.obs, -data.actions, dt=data.dt)
+    found = other_convention(twin, smoothed_motion(twin, turned), ())
+    assert found.key == "direction.axis" and "As well possible: The command" in found.words
+
+    twin, data = shaken_axis(late=0.5)
+    assert other_convention(twin, smoothed_motion(twin, data), ()) is None
+
+
 @pytest.fixture(scope="module")
 def swinging_arm():
     """An arm of three joints with more friction than its model, and a log of it."""

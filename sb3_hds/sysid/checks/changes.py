@@ -6,6 +6,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from sb3_hds.core import Twin
 from sb3_hds.sysid.equation.regression import Equation
@@ -17,6 +18,11 @@ _OTHER_UNITS = 3.0
 _TOLD_BY_LOAD = 0.5
 # Friction is compared where a joint is faster than this share of its top speed.
 _MOVING = 0.05
+# Lags and delays of commands, in intervals.
+_LAGS = tuple(2**k for k in range(7))
+_DELAYS = (*range(1, 8), 9, 11, 13, 15, 18, 22, 26, 31, 37, 45, 54, 64, 77, 92, 110, 130)
+# Longest delay, in shares of the shortest recording.
+_MOST_LATE = 0.5
 # A joint may move beyond its model's limits by this factor; without limits, by a few turns [rad].
 _BEYOND, _TURNS = 1.5, 4.0 * np.pi
 # Gear ratios that are tried: up to 500, a twentieth apart, and then closer.
@@ -200,6 +206,27 @@ def _scale_of(force: np.ndarray, load: np.ndarray, v: np.ndarray) -> float | Non
     share = float(own @ by_load) / float(by_load @ by_load)
     explained = share * float(own @ by_load) / float(own @ own)
     return 1.0 / share if explained > _TOLD_BY_LOAD else None
+
+
+def late_commands(motion: Motion) -> Iterator[Change]:
+    """
+    :return: commands that act late, by a lag or a delay. They are no conventions, but may turn
+        commands by half a period, as a wrong sign does.
+    """
+    for n in _LAGS:
+        yield Change("lag", (), "", actions=partial(_lagging, n))
+    shortest = min(len(r.actions) for r in motion.recordings)
+    for n in (n for n in _DELAYS if n < _MOST_LATE * shortest):
+        later, earlier = partial(_part, slice(n, None)), partial(_part, slice(None, -n))
+        yield Change("delay", (), "", q=later, slopes=later, actions=earlier)
+
+
+def _lagging(n: int, commands: np.ndarray) -> np.ndarray:
+    return np.asarray(lfilter([1.0 / (n + 1.0)], [1.0, -n / (n + 1.0)], commands, axis=0))
+
+
+def _part(rows: slice, x: np.ndarray) -> np.ndarray:
+    return x[rows]
 
 
 def turning_too_far(twin: Twin, motion: Motion) -> list[int]:

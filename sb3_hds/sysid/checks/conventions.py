@@ -16,6 +16,7 @@ from sb3_hds.effects import ConstantForce, CoulombFriction, ViscousFriction
 from sb3_hds.sysid.checks.changes import (
     Change,
     changes_of_columns,
+    late_commands,
     other_gears,
     other_mountings,
     other_units_of_torques,
@@ -35,6 +36,8 @@ _ROWS, _FEW_ROWS, _LIKELIEST = 3000, 1000, 4
 _SMALLER, _WORTH = 2.0, 30.0
 # It concerns a joint whose residual it changes by this factor.
 _CONCERNED = 1.1
+# Changes that look like commands that are late by half a period.
+_REVERSING = ("direction", "command")
 # At most so many changes are listed that would do as well, to within _WORTH.
 _AS_GOOD = 2
 # Residuals below this multiple of the noise need no other convention.
@@ -162,8 +165,13 @@ def other_convention(twin: Twin, motion: Motion, nuisances: Sequence[str]) -> Co
         ranked = [one for one in _likeliest(log, now) if now.accepts(one.residual)]
         if not ranked:
             break
-        least = now.gain(ranked[0].residual) - _WORTH
         best, *others = ranked
+        gain = now.gain(best.residual)
+        if best.change.name in _REVERSING and any(
+            now.gain(log.changed(late).residual) > gain for late in late_commands(log.motion)
+        ):
+            break
+        least = gain - _WORTH
         others = [x.change.words for x in others if now.gain(x.residual) > least][:_AS_GOOD]
         said += [best.change.words, *(f"As well possible: {words}" for words in others)]
         log, now = log.changed(best.change), best.residual

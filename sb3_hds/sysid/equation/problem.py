@@ -242,15 +242,17 @@ class Problem:
             return False
         if found.free and self._inflation(found.free, found.inverse).max() > _MOST_INFLATION:
             return False
-        return all(self._inside(i, found) for i in keys)
+        value = found.value
+        return all(self._inside(i, found, value) for i in keys)
 
     def out_of_bounds(self, keys: Sequence[int]) -> list[int]:
         """:return: members at their bounds, or with sizes that are physically impossible"""
         found = self.solve(keys)
-        return [i for i in keys if not self._inside(i, found)]
+        value = found.value
+        return [i for i in keys if not self._inside(i, found, value)]
 
-    def _inside(self, i: int, found: Solution) -> bool:
-        item, value = self.items[i], found.value
+    def _inside(self, i: int, found: Solution, value: Mapping[int, float]) -> bool:
+        item = self.items[i]
         if i in self.always or not item.free or not value.keys() >= set(item.free):
             return True
         if item.rule == "chain":
@@ -357,36 +359,50 @@ class Problem:
             out.append(rss * np.exp(-taken))
         return np.array(out)
 
+    @cached_property
+    def _columns_by_item(self) -> tuple[np.ndarray, np.ndarray]:
+        """Items without those that are chains, each as often as it has columns, and the columns."""
+        pairs = [
+            (i, c)
+            for i, item in enumerate(self.items)
+            if item.rule != "chain"
+            for c in item.columns
+        ]
+        found = np.array(pairs, int).reshape(-1, 2)
+        return found[:, 0], found[:, 1]
+
+    @cached_property
+    def _chains(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Items that are chains, their first columns, and their second ones."""
+        found = [(i, *item.columns) for i, item in enumerate(self.items) if item.rule == "chain"]
+        chains, whole, part = np.array(found, int).reshape(-1, 3).T
+        return chains, whole, part
+
     def ranking(self, keys: Sequence[int], among: Sequence[int] | None = None) -> list[int]:
         """:return: items by how much they would lower the residual, best first"""
         found = self.solve(keys)
         if not np.isfinite(found.rss):
             return []
-        pool = [i for i in range(len(self.items)) if i not in keys] if among is None else [*among]
-        own = sorted({c for i in pool for c in self.items[i].columns})
-        at = dict(zip(own, range(len(own)), strict=True))
+        pool = np.full(len(self.items), among is None)
+        pool[list(keys if among is None else among)] = among is not None
+        items, columns = (x[pool[self._columns_by_item[0]]] for x in self._columns_by_item)
+        chains, whole, part = (x[pool[self._chains[0]]] for x in self._chains)
+        own = np.unique(np.concatenate([columns, whole, part]))
+        columns, first, second = (np.searchsorted(own, x) for x in (columns, whole, part))
         on = np.flatnonzero(found.weights)
-        rows = self.total[own]
-        r, cross = rows[:, on] @ found.weights[on], rows[:, found.free]
+        r = (found.weights[on] @ self.total[on])[own]
+        cross = self.total[found.free][:, own].T
         taken = cross @ found.inverse
         diagonal = self.diagonal[own]
         left = np.maximum(diagonal - (taken * cross).sum(1), 1e-9)
         drop = np.where(left > 1e-5 * diagonal, r**2 / left, 0.0)
-        gains = []
-        for i in pool:
-            item = self.items[i]
-            if item.rule != "chain":
-                gains.append(float(sum(drop[at[c]] for c in item.free)))
-                continue
-            whole, part = (at[c] for c in item.columns)
-            value = 2.0 * r[whole] - left[whole]
-            mixed = self.total[own[whole], own[part]] - taken[whole] @ cross[part]
-            if left[part] > 0.0:
-                share = np.clip((r[part] - mixed) / left[part], 0.0, 1.0)
-                value += 2.0 * share * (r[part] - mixed) - share**2 * left[part]
-            gains.append(float(value))
+        gains = np.bincount(items, drop[columns], len(self.items)).astype(float)
+        mixed = self.total[whole, part] - (taken[first] * cross[second]).sum(1)
+        share = np.clip((r[second] - mixed) / left[second], 0.0, 1.0)
+        gains[chains] = 2.0 * r[first] - left[first]
+        gains[chains] += 2.0 * share * (r[second] - mixed) - share**2 * left[second]
         order = np.argsort(gains)[::-1]
-        return [pool[k] for k in order if gains[k] > 0.5 * self.cost]
+        return [int(i) for i in order if gains[i] > 0.5 * self.cost]
 
     def force_shares(self, keys: Sequence[int]) -> np.ndarray:
         """:return: of each member, the largest share of a joint's force that it carries"""
