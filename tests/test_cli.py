@@ -16,6 +16,8 @@ from measuring import measured
 from sb3_hds import Trajectories, cli, effects, twins
 from sb3_hds.cli import catalogue
 from sb3_hds.cli import measured as measured_room
+from sb3_hds.cli.arguments import settings
+from sb3_hds.errors import ParameterError
 from sb3_hds.experiments import PolicyGain
 from sb3_hds.experiments.policy_gain import _summarised
 from sb3_hds.sysid import Diagnosis
@@ -204,13 +206,13 @@ def empty_log(folder, n_obs=2, n_act=0, dt=0.01):
 
 def test_a_twin_is_set_by_words_and_commas_separate_names(asked, tmp_path, capsys):
     log = empty_log(tmp_path, 1, 1)
-    settings = {
+    given_settings = {
         "FreePendulum": ["observe:q", "zero:up", "driven:true", "mass:2e-1", "substeps:4"],
         "ServoPendulum": ["commands:goal, enable"],
     }
     words = ["--calibrate", "mass,com", "damping", "--effects", "stiffness,", "cogging"]
 
-    for name, given in settings.items():
+    for name, given in given_settings.items():
         ask("--twin", name, "--data", log, "--set", *given, *words)
 
     (free, _, given), (servo, *_) = asked
@@ -220,6 +222,19 @@ def test_a_twin_is_set_by_words_and_commas_separate_names(asked, tmp_path, capsy
     assert given["effects"] == ["stiffness", "cogging"]
     # A warning is one line without code.
     assert capsys.readouterr().err == 2 * "warning: Rows are uneven.\n"
+
+
+@each(
+    ("a:1e-3", 1e-3),
+    ("a:yes", "yes"),
+    ("a:[0, 1.5]", [0, 1.5]),
+    ("a:{b: 1}", {"b": 1}),
+    ("a:true", True),
+)
+def test_options_of_environments_and_of_twins_are_read_alike(text, value):
+    assert settings("--env-kwargs", [text]) == {"a": value}
+    with pytest.raises(ParameterError, match="'\\[1' is no list"):
+        settings("--set", ["a:[1"])
 
 
 @pytest.fixture

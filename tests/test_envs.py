@@ -162,3 +162,9 @@ def test_our_ids_and_their_step_limits_are_those_of_the_twins():
     assert gymnasium.registry == registry
     made = gymnasium.make("sb3_hds/CartPoleSwingUp-v0", cart_mass=2.0)
     assert made.unwrapped.twin.values["cart_mass"] == pytest.approx(2.0)
+
+
+def test_a_pendulum_with_a_delay_is_stepped_without_a_reset():
+    env = gymnasium.make("sb3_hds/PendulumReal-v1", delay=0.05, disable_env_checker=True).unwrapped
+    obs, *_ = env.step(np.array([1.0]))
+    assert np.isfinite(obs).all()

@@ -66,7 +66,7 @@ def settings(option: str, texts: Sequence[str]) -> dict[str, Any]:
     """
     :param option: to name in an error message
     :param texts: ``NAME:VALUE`` each
-    :return: values by name: bool, int, float or str
+    :return: values by name: bool, int, float or str, or a list or mapping written as in yml
     :raises ParameterError: for text of another form
     """
     found: dict[str, Any] = {}
@@ -74,11 +74,18 @@ def settings(option: str, texts: Sequence[str]) -> dict[str, Any]:
         name, colon, value = text.partition(":")
         if not (name and colon and value):
             raise ParameterError(f"{option} takes NAME:VALUE, got '{text}'.")
-        found[name] = _value(value)
+        found[name] = _value(option, value)
     return found
 
 
-def _value(text: str) -> bool | int | float | str:
+def _value(option: str, text: str) -> Any:
+    if text.startswith(("[", "{")):
+        import yaml
+
+        try:
+            return yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ParameterError(f"{option}: '{text}' is no list or mapping of yml.") from error
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
     for kind in (int, float):

@@ -5,6 +5,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from sb3_hds.cli.arguments import settings
 from sb3_hds.errors import EnvironmentMismatchError, ParameterError, did_you_mean
 from sb3_hds.wrappers.by_name import imported
 
@@ -100,19 +101,8 @@ def bare_environment(given: argparse.Namespace) -> Any:
     :raises EnvironmentMismatchError: if there is no such environment
     """
     import gymnasium
-    import yaml
 
-    kwargs = {}
-    for text in given.env_kwargs:
-        name, colon, value = text.partition(":")
-        try:
-            kwargs[name] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            colon = ""
-        if not (name and colon):
-            raise ParameterError(
-                f"--env-kwargs takes NAME:VALUE with a value as in yml, got '{text}'."
-            )
+    kwargs = settings("--env-kwargs", given.env_kwargs)
     try:
         return gymnasium.make(given.env, **kwargs)
     except (gymnasium.error.Error, TypeError) as error:

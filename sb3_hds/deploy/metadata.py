@@ -96,8 +96,11 @@ def _channels_and_actuators(
         case spaces.Discrete():
             return channels, [{"name": "action", "n": int(space.n), "start": int(space.start)}]
         case spaces.MultiDiscrete():
-            counts = enumerate(space.nvec.ravel())
-            return channels, [{"name": f"action[{i}]", "n": int(n), "start": 0} for i, n in counts]
+            choices = enumerate(zip(space.nvec.ravel(), space.start.ravel(), strict=True))
+            return channels, [
+                {"name": f"action[{i}]", "n": int(n), "start": int(start)}
+                for i, (n, start) in choices
+            ]
     raise ExportError(f"Actions of this kind cannot be exported: {space}.")
 
 

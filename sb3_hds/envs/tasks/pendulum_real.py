@@ -25,6 +25,8 @@ _MAX_TORQUE = 2.0  # [N m]
 _ENGINE_STEP = 0.0025  # [s]
 # Moment of inertia about the rod's own axis, relative to that about its centre.
 _THIN_ROD = 1e-3
+# Time and torque of the command before the first one.
+_NO_COMMAND = (-math.inf, 0.0)
 _LONGEST_DELAY = 0.2  # [s]
 
 
@@ -90,7 +92,7 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
         self.data = engine.MjData(self.model)
         self.action_space = spaces.Box(-_MAX_TORQUE, _MAX_TORQUE, (1,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
-        self._commands: list[tuple[float, float]] = []
+        self._commands: list[tuple[float, float]] = [_NO_COMMAND]
         self._drive = 0.0
         self._canvas: Any = None
 
@@ -115,7 +117,7 @@ class PendulumReal(gymnasium.Env[np.ndarray, np.ndarray]):
         if options:
             start = _start_state(options)
         self.data.qpos[0], self.data.qvel[0] = start
-        self._commands, self._drive = [(-math.inf, 0.0)], 0.0
+        self._commands, self._drive = [_NO_COMMAND], 0.0
         return self._observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
