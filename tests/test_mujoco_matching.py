@@ -187,3 +187,14 @@ def test_currents_in_the_place_of_torques_are_remarked():
     assert not match(
         arm(), [f"{name}_{x}" for x in ("pos", "vel", "tau") for name in NAMES]
     ).remarks
+
+
+@each("{}", "fer_{}", "{}_of_mine")
+def test_beside_a_position_a_column_without_a_quantity_is_a_command_at_most(form):
+    joints = [form.format(name) for name in NAMES]
+    named = [f"{name}_{kind}" for kind in ("position", "velocity") for name in joints]
+    found = match(arm(), [*named, *joints])
+
+    assert [*found.obs] == named and found.actions == (None,) * 3
+    wanted = [(f"m{i} (command)", (joint,)) for i, joint in enumerate(joints)]
+    assert [*found.missing] == wanted

@@ -144,6 +144,8 @@ def _matched(signals: Sequence[Signal], n: int, parsed: Mapping[str, Parsed]) ->
             scores = {name: parsed[name].score(signal.joint) for name in alike}
             best = max(scores.values(), default=0.0)
             first = [name for name, score in scores.items() if score == best > 0.0]
+            # Beside a column that is called a position, one without a quantity is none.
+            first = [name for name in first if parsed[name].told or len(first) == 1]
             if len(first) == 1:
                 taken.add(first[0])
                 return first[0]
@@ -182,7 +184,7 @@ def _nearest(signals: Sequence[Signal], unused: Mapping[str, Parsed]) -> list[tu
     for signal in signals:
         words = Parsed.of(signal.joint).joint
         core = words[len(own.before) : len(words) - len(own.after)]
-        fitting = [name for name, column in unused.items() if column.kinds in signal.kinds]
+        fitting = [name for name, x in unused.items() if x.kinds in signal.kinds or not x.told]
         scores = {name: likeness(core, unused[name].joint) for name in fitting}
         best = max(scores.values(), default=0.0)
         near = [name for name in fitting if scores[name] == best >= _NEAR]

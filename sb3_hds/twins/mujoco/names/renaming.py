@@ -149,7 +149,8 @@ def _column_of(words: Words, signal: Signal, parsed: Mapping[str, Parsed]) -> st
     for kinds in signal.kinds:
         alike = [name for name, p in parsed.items() if p.kinds == kinds and p.joint == words]
         if alike:
-            return alike[0] if len(alike) == 1 else None
+            told = [name for name in alike if parsed[name].told or len(alike) == 1]
+            return told[0] if len(told) == 1 else None
     return None
 
 

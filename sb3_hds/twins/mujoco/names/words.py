@@ -39,17 +39,19 @@ class Parsed:
     """
     :param joint: the words of a column's name that may be those of a joint
     :param kinds: the quantities that it names; without any, it is a position
+    :param told: whether it names any
     """
 
     joint: tuple[str, ...]
     kinds: frozenset[str]
+    told: bool
 
     @classmethod
     def of(cls, name: str) -> "Parsed":
         words = tokens(name)
         kinds = frozenset(_KIND_OF[word] for word in words if word in _KIND_OF)
         joint = tuple(word for word in words if word not in _KIND_OF and word not in _IGNORED)
-        return cls(joint, kinds or frozenset([POSITION]))
+        return cls(joint, kinds or frozenset([POSITION]), bool(kinds))
 
     def rest(self, joint: str) -> tuple[str, ...]:
         """:return: words that are not in the name of the joint"""
