@@ -12,8 +12,8 @@ from sb3_hds.sysid.comparison.search import Place, Search
 from sb3_hds.sysid.equation.held_out_folds import simpler_items
 from sb3_hds.sysid.equation.members import Member
 from sb3_hds.sysid.equation.plausibility import rarity_of
+from sb3_hds.sysid.equation.problem import LATE
 from sb3_hds.sysid.equation.screening import Screened
-from sb3_hds.sysid.equation.selection import LATE
 from sb3_hds.sysid.equation.weak_form import FOLDS
 from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point, in_threads
@@ -154,6 +154,7 @@ def _preferred(search: Search, rival: Tried, member: Candidate, base: Base) -> b
 
 def _judge_many(search: Search, screened: Screened, start: Base, base: Base) -> _Judged:
     """Replace members that surely make held-out predictions worse by simpler ones, or none."""
+    screened, base = _with_likelier(search, screened, start, base)
     members = _members(search, screened)
     verdicts = _each_left_out(search, screened, start, base, members, list(members))
     harmful = {key for key, v in verdicts.items() if v.p_value >= 1.0 - _LEVEL}
@@ -165,6 +166,26 @@ def _judge_many(search: Search, screened: Screened, start: Base, base: Base) -> 
         new = [key for key in members if key not in verdicts]
         verdicts |= _each_left_out(search, screened, start, base, members, new)
     return _Judged(screened, base, verdicts, {})
+
+
+def _with_likelier(
+    search: Search, screened: Screened, start: Base, base: Base
+) -> tuple[Screened, Base]:
+    """:return: the set with what the equation hardly tells from a member, where it is preferred"""
+    for member in screened.members:
+        members = _members(search, screened)
+        others = screened.problem.hardly_told_from(member.item)
+        if not others or member.key not in members:
+            continue
+        candidate, _ = members[member.key]
+        lost = search.without(base, candidate, near=base, rival=base)
+        tried = _in_place_of(search, screened, start, base, member.key, lost, others)
+        better = [t for t in tried if _preferred(search, t, candidate, base)]
+        if better:
+            best = max(better, key=lambda t: t.criterion)
+            screened = screened.with_other(member.key, best.candidate.key)
+            base = search.believing(best, lost)
+    return screened, base
 
 
 def _rivals(
@@ -180,24 +201,38 @@ def _rivals(
     :param lost: the model without the member
     :param exchanged: by key of a member, the one in whose place it is
     :return: candidates in its place, fitted from their sizes in the equation of motion: those that
-        predict as well there, simpler ones of its family, and of what makes commands late the other
-        kind, which differs from it by what the equation hardly shows
+        predict as well there, simpler ones of its family, and those that differ from it by what the
+        equation hardly shows
     """
     members = _members(search, screened)
-    candidate, member = members[key]
+    _, member = members[key]
     simpler = simpler_items(screened.problem, member.item)
     others = dict.fromkeys([*member.others, *(screened.problem.items[i].key for i in simpler)])
     if key in exchanged:
         others[exchanged[key]] = None
-    if candidate.name in LATE:
-        others |= dict.fromkeys(f"{name}.{candidate.place}" for name in LATE)
+    others |= dict.fromkeys(screened.problem.hardly_told_from(member.item))
+    return _in_place_of(search, screened, start, base, key, lost, others)
+
+
+def _in_place_of(
+    search: Search,
+    screened: Screened,
+    start: Base,
+    base: Base,
+    key: str,
+    lost: Base,
+    others: Iterable[str],
+) -> list[Tried]:
+    """:return: other candidates in the place of a member, fitted"""
+    members = _members(search, screened)
+    candidate, _ = members[key]
     known = {c.key: c for c in search.hypotheses.candidates if c.key not in members}
     rivals = [known[other] for other in others if other in known]
     rest = [k for k in members if k != key]
     places = {}
     for rival in rivals:
         starts = [_sizes_with(search, screened, start, [*rest, rival.key])]
-        if candidate.name in LATE and rival.name in LATE:
+        if {candidate.name, rival.name} <= {*LATE}:
             starts.append(_as_late(search, base.point.theta, candidate, rival))
         cost_at = lambda theta: search.select.evidence.nearest(theta, [base.point.offsets])[1]  # noqa: E731
         places[rival.key] = Place(min(starts, key=cost_at), base.point.offsets, lost.free)

@@ -28,6 +28,10 @@ _LEAST_LEFT = 0.02
 _LEAST_SLIDING = 0.3
 # Nonlinear parameters that cost as much as coefficients: a speed, a period.
 _HIDDEN = {"stribeck_friction": 1, "concave_friction": 1, "cogging": 1}
+#: friction that nearly every joint has
+VISCOUS, DRY = "viscous_friction", "coulomb_friction"
+#: effects that make commands late
+LATE = ("action_delay", "motor_lag")
 #: effects that multiply commands
 GAINS = ("torque_gain", "directional_gain")
 # Iterations for the product of a gain and what else changes the command.
@@ -115,6 +119,21 @@ class Problem:
             return True
         common = {f[0] for f in families if f[1:] == SHARED}
         return any(f[0] in common and f[1:2] == ("actuator",) and f[2] >= 0 for f in families)
+
+    def hardly_told_from(self, i: int) -> list[str]:
+        """
+        :return: keys of candidates that differ from an item by what the equation hardly shows: of
+            what makes commands late the other kind, and for a dead zone dry friction, which holds a
+            joint that sticks with an unknown force
+        """
+        candidate = self.items[i].candidate
+        if candidate.name in LATE:
+            return [f"{name}.{candidate.place}" for name in LATE if name != candidate.name]
+        if candidate.name != "dead_zone":
+            return []
+        acting = [*self.joints(i)]
+        dry = (item.candidate for item in self.items if item.candidate.name == DRY)
+        return [c.key for c in dry if [c.index] == acting]
 
     def joints(self, i: int) -> np.ndarray:
         """:return: where an item acts"""

@@ -17,8 +17,8 @@ from sb3_hds.sysid.equation.members import (
     friction_curves,
     members,
 )
-from sb3_hds.sysid.equation.problem import GAINS, Problem
-from sb3_hds.sysid.equation.selection import LATE, propose
+from sb3_hds.sysid.equation.problem import GAINS, LATE, Problem
+from sb3_hds.sysid.equation.selection import propose
 from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.estimation.parameters import Belief
@@ -228,6 +228,7 @@ def screen(
         where = [n for n, much in zip(where, left, strict=True) if much and len(set_of) < 2]
     keys = {m.key for m in set_of}
     keys |= {p.items[o].key for m in set_of for o in simpler_items(p, m.item)}
+    keys |= {key for m in set_of for key in p.hardly_told_from(m.item)}
     if small or len(set_of) < 2:
         keys |= {*(k for m in set_of for k in m.others), *_singles(p), *hints}
         keys |= _without_column(hypotheses, p, moved, where)

@@ -16,7 +16,7 @@ from sb3_hds.sysid.equation.held_out_folds import (
     simpler_items,
     substitutes,
 )
-from sb3_hds.sysid.equation.problem import SHARED, Problem
+from sb3_hds.sysid.equation.problem import DRY, LATE, SHARED, VISCOUS, Problem
 from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Moves that are tried from each set: best additions, best substitutes of a member, and rounds.
@@ -27,9 +27,6 @@ _MOST_ROUNDS = 3
 _FOR_TWO, _RETUNED = 2, 3
 # Rarity from which members are retried without, and how many.
 _DOUBTFUL, _MOST_SHAKEN = 1.5, 4
-_VISCOUS, _DRY = "viscous_friction", "coulomb_friction"
-#: effects that make commands late
-LATE = ("action_delay", "motor_lag")
 # Number of joints from which the same effect may stand for one that all actuators share.
 _MANY_JOINTS = 3
 # Least share of a joint's force that a member carries, least t statistic of its held-out gain, and
@@ -120,7 +117,7 @@ def _starts(p: Problem) -> list[list[int]]:
 
 def _friction_beside(p: Problem, others: list[int]) -> list[int]:
     """Viscous and dry friction at all joints, without what would have a negative size."""
-    names = (_VISCOUS, _DRY)
+    names = (VISCOUS, DRY)
     friction = [i for i, item in enumerate(p.items) if item.candidate.name in names]
     return _within_bounds(p, others, friction)
 
@@ -183,7 +180,7 @@ def _one_for_two(p: Problem, keys: list[int]) -> list[list[int]]:
     """
     trials = []
     open_to = [
-        i for i in keys if i not in p.always and p.items[i].candidate.name not in (_VISCOUS, _DRY)
+        i for i in keys if i not in p.always and p.items[i].candidate.name not in (VISCOUS, DRY)
     ]
     others = {i: substitutes(p, keys, i) for i in open_to}
     for one, other in itertools.combinations(open_to, 2):
