@@ -12,7 +12,7 @@ from sb3_hds.sysid.comparison.search import Place, Search
 from sb3_hds.sysid.equation.held_out_folds import simpler_items
 from sb3_hds.sysid.equation.members import Member
 from sb3_hds.sysid.equation.plausibility import rarity_of
-from sb3_hds.sysid.equation.problem import LATE
+from sb3_hds.sysid.equation.regressors import LATE
 from sb3_hds.sysid.equation.screening import Screened
 from sb3_hds.sysid.equation.weak_form import FOLDS
 from sb3_hds.sysid.estimation.candidates import Candidate

@@ -16,8 +16,9 @@ from sb3_hds.sysid.equation.effect_columns import (
     nodes_of,
 )
 from sb3_hds.sysid.equation.plausibility import plausibility, rarity_of
-from sb3_hds.sysid.equation.problem import LATE, Problem
+from sb3_hds.sysid.equation.problem import Problem
 from sb3_hds.sysid.equation.regression import STEP, Equation, Item, Rows, put, residual_force
+from sb3_hds.sysid.equation.regressors import LATE
 from sb3_hds.sysid.equation.terms import effective_inertia, terms
 from sb3_hds.sysid.equation.weak_form import grams
 from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate

@@ -4,8 +4,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sb3_hds.sysid.equation.problem import SHARED, Problem
+from sb3_hds.sysid.equation.problem import Problem
 from sb3_hds.sysid.equation.regression import TINY
+from sb3_hds.sysid.equation.regressors import SHARED
 from sb3_hds.sysid.equation.weak_form import rich_columns
 
 # An alternative may score worse by this, and predicts held-out data as well to within this t or

@@ -17,7 +17,8 @@ from sb3_hds.sysid.equation.members import (
     friction_curves,
     members,
 )
-from sb3_hds.sysid.equation.problem import GAINS, LATE, Problem
+from sb3_hds.sysid.equation.problem import Problem
+from sb3_hds.sysid.equation.regressors import GAINS, LATE
 from sb3_hds.sysid.equation.selection import propose
 from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses

@@ -16,7 +16,8 @@ from sb3_hds.sysid.equation.held_out_folds import (
     simpler_items,
     substitutes,
 )
-from sb3_hds.sysid.equation.problem import DRY, LATE, SHARED, VISCOUS, Problem
+from sb3_hds.sysid.equation.problem import Problem
+from sb3_hds.sysid.equation.regressors import DRY, LATE, SHARED, VISCOUS
 from sb3_hds.sysid.estimation.candidates import PARAMETER
 
 # Moves that are tried from each set: best additions, best substitutes of a member, and rounds.
