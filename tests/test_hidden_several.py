@@ -21,6 +21,8 @@ from several_scores import score_case
 
 from sb3_hds import effects
 from sb3_hds.sysid.checks.timing import match_logged_integrator
+from sb3_hds.sysid.comparison import several
+from sb3_hds.sysid.diagnosis.pipeline import Inquiry
 from sb3_hds.sysid.equation.screening import screen
 from sb3_hds.sysid.equation.selection import _one_for_two
 from sb3_hds.sysid.motion.motion import smoothed_motion
@@ -119,6 +121,28 @@ def test_sets_are_judged_cause_by_cause_and_name_by_name(said, named, right, fla
 def screened():
     twin, data, _ = match_logged_integrator(*first_users.joint_with_friction())
     return screen(twin, smoothed_motion(twin, data), effects.ALL, ())
+
+
+def test_the_equation_hardly_tells_a_lag_from_a_delay_nor_dry_friction_from_a_dead_zone(screened):
+    p = screened.problem
+    told = {item.key: p.hardly_told_from(i) for i, item in enumerate(p.items)}
+
+    assert told["dead_zone.force"] == [DRY] and told[VISCOUS] == told[DRY] == []
+    assert told["motor_lag.force"] == ["action_delay.force"]
+
+
+@each(6, 1)
+def test_dry_friction_is_fitted_in_the_place_of_a_dead_zone(largest, monkeypatch):
+    monkeypatch.setattr(several, "_MANY", largest)
+    given = first_users.joint_with_friction()
+    inquiry = Inquiry(*given, effects.ALL, (), 0, "quick", False)
+    proposed = inquiry.screened.with_other(DRY, "dead_zone.force")
+    assert {m.key for m in proposed.members} == {VISCOUS, "dead_zone.force"}
+    inquiry.split_halves()
+
+    found = inquiry._several(proposed)
+
+    assert {f.key for f in found.findings} == {VISCOUS, DRY}
 
 
 def test_what_is_there_shows_and_what_is_not_does_not(screened):
