@@ -245,7 +245,7 @@ def other_gears(
     twin: Twin, motion: Motion, residual: Callable[[Change], float]
 ) -> Iterator[Change]:
     """
-    :param residual: of the equation of motion under a change
+    :param residual: measure of what is left of the equation of motion under a change
     :return: positions on the motor's side of a gear, at each joint that moves too far, and at all
         of them with one ratio
     """
@@ -265,7 +265,7 @@ def _geared(twin: Twin, places: list[int], ratio: float) -> Change:
     names = tuple(twin.joints[j].name for j in places)
     words = (
         f"The motion of {', '.join(names)} is larger than the model allows, and fits if positions "
-        f"and velocities are divided by about {ratio:.3g}: they are probably those of the motor, "
+        f"and velocities are divided by about {float(f'{ratio:.2g}'):g}: they are probably those of the motor, "
         "on the other side of a gear. Write their columns with 1 / gear ratio as scale."
     )
     divided = partial(np.multiply, scale)

@@ -22,8 +22,9 @@ from sb3_hds.sysid.checks.changes import (
     other_units_of_torques,
     turning_too_far,
 )
-from sb3_hds.sysid.equation.assembly import assemble, normal_problem
+from sb3_hds.sysid.equation.assembly import assemble, normal_problem, rows_of
 from sb3_hds.sysid.equation.regression import Equation, squares
+from sb3_hds.sysid.equation.terms import terms
 from sb3_hds.sysid.estimation.hypotheses import Hypotheses
 from sb3_hds.sysid.motion.motion import JointMotion, Motion
 
@@ -31,6 +32,8 @@ from sb3_hds.sysid.motion.motion import JointMotion, Motion
 _ALWAYS = (ViscousFriction, CoulombFriction, ConstantForce)
 # Rows of the test, at most; all changes are ranked on fewer, and only the likeliest are tested.
 _ROWS, _FEW_ROWS, _LIKELIEST = 3000, 1000, 4
+# Of more changes than this, the likeliest by ordinary least squares are ranked.
+_MANY = 12
 # A change is accepted if it lowers the residuals of the joints that it concerns by this factor, in
 # their geometric mean, and -2 log likelihood by this much.
 _SMALLER, _WORTH = 2.0, 30.0
@@ -38,6 +41,8 @@ _SMALLER, _WORTH = 2.0, 30.0
 _CONCERNED = 1.1
 # Changes that look like commands that are late by half a period.
 _REVERSING = ("direction", "command")
+# Shares of a force that count as nothing.
+_SAME = 1e-3
 # At most so many changes are listed that would do as well, to within _WORTH.
 _AS_GOOD = 2
 # Residuals below this multiple of the noise need no other convention.
@@ -113,11 +118,6 @@ class _Residual(NamedTuple):
     of_joint: np.ndarray
     equation: Equation
 
-    @property
-    def mean(self) -> float:
-        """Geometric mean over the joints, in units of the noise."""
-        return float(np.exp(np.mean(np.log(self.of_joint + 1e-300))))
-
     def ratio(self, then: "_Residual") -> np.ndarray:
         """:return: of both, by joint; what is below the noise counts as noise"""
         found = np.maximum(self.of_joint, 1.0) / np.maximum(then.of_joint, 1.0)
@@ -192,20 +192,43 @@ def _mean(residual: np.ndarray) -> float:
 def _likeliest(log: _Log, now: _Residual) -> list[_Ranked]:
     """:return: changes that lower the residual, the largest gain first"""
     twin, few = log.twin, log.fewer()
+
+    def left(change: Change) -> float:
+        changed = twin.with_parameters(**change.values)
+        return float(np.log(_left(changed, change.motion(few.motion))).sum())
+
     units = other_units_of_torques(twin, now.equation)
     changes = [
         *changes_of_columns(twin),
         *other_mountings(twin),
         *([units] if units else []),
-        *other_gears(twin, few.motion, lambda change: few.changed(change).residual.mean),
+        *other_gears(twin, few.motion, left),
     ]
     if far := turning_too_far(twin, log.motion):
         # Where a joint turns too far, nothing else is the reason for the residual.
         nearer = [c for c in changes if len(turning_too_far(twin, c.motion(log.motion))) < len(far)]
         changes = nearer or changes
+    if len(changes) > _MANY and not log.known.nuisances:
+        changes = sorted(changes, key=left)[:_MANY]
     if few.motion is not log.motion:
         changes = [x.change for x in _ranked(few, changes, few.residual)[:_LIKELIEST]]
     return _ranked(log, changes, now)
+
+
+def _left(twin: Twin, motion: Motion) -> np.ndarray:
+    """
+    :return: share of each joint's force that friction and an offset leave in the equation of
+        motion, by ordinary least squares on all rows
+    """
+    rows = rows_of(motion)
+    found = terms(twin, twin.params, rows.q, rows.v, rows.actions)
+    load = np.einsum("nij,nj->ni", found.mass, rows.a) + found.bias
+    left = []
+    for force, v in zip((load - found.actuator).T, rows.v.T, strict=True):
+        friction = np.stack([v, np.sign(v), np.ones_like(v)], 1)
+        left.append(np.std(force - friction @ np.linalg.lstsq(friction, force, rcond=None)[0]))
+    size = np.sqrt(np.mean(found.actuator**2 + load**2, axis=0))
+    return np.maximum(np.divide(left, size, where=size > 0.0, out=np.ones(len(left))), _SAME)
 
 
 def _ranked(log: _Log, changes: Sequence[Change], now: _Residual) -> list[_Ranked]:

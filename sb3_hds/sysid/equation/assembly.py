@@ -48,7 +48,7 @@ def assemble(hypotheses: Hypotheses, motion: Motion, quick: bool = False) -> Equ
     :param quick: only the forces of ``CLOSED_FORMS``, which need no compilation, with the mass
         matrix as effective inertia
     """
-    twin, rows = hypotheses.nominal, _rows(motion)
+    twin, rows = hypotheses.nominal, rows_of(motion)
     given = (twin, twin.params, rows.q, rows.v, rows.actions)
     found = terms(*given)
     inertia = found.mass if quick else effective_inertia(*given, found)
@@ -101,7 +101,8 @@ def refuted_by_kinematics(twin: Twin, motion: Motion) -> set[str]:
     return found
 
 
-def _rows(motion: Motion) -> Rows:
+def rows_of(motion: Motion) -> Rows:
+    """:return: all intervals of all recordings"""
     parts = [
         (
             r.q[:-1],
