@@ -263,9 +263,10 @@ def _geared(twin: Twin, places: list[int], ratio: float) -> Change:
     scale = np.ones(len(twin.joints))
     scale[places] = 1.0 / ratio
     names = tuple(twin.joints[j].name for j in places)
+    about = float(f"{ratio:.2g}")
     words = (
         f"The motion of {', '.join(names)} is larger than the model allows, and fits if positions "
-        f"and velocities are divided by about {float(f'{ratio:.2g}'):g}: they are probably those of the motor, "
+        f"and velocities are divided by about {about:g}: they are probably those of the motor, "
         "on the other side of a gear. Write their columns with 1 / gear ratio as scale."
     )
     divided = partial(np.multiply, scale)
