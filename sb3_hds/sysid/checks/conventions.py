@@ -217,8 +217,8 @@ def _likeliest(log: _Log, now: _Residual) -> list[_Ranked]:
 
 def _left(twin: Twin, motion: Motion) -> np.ndarray:
     """
-    :return: share of each joint's force that friction and an offset leave in the equation of
-        motion, by ordinary least squares on all rows
+    :return: what friction and an offset leave of each joint's equation of motion, by ordinary least
+        squares on all rows, in units of the actuator's force [1]; without one, [N m] or [N]
     """
     rows = rows_of(motion)
     found = terms(twin, twin.params, rows.q, rows.v, rows.actions)
@@ -227,8 +227,9 @@ def _left(twin: Twin, motion: Motion) -> np.ndarray:
     for force, v in zip((load - found.actuator).T, rows.v.T, strict=True):
         friction = np.stack([v, np.sign(v), np.ones_like(v)], 1)
         left.append(np.std(force - friction @ np.linalg.lstsq(friction, force, rcond=None)[0]))
-    size = np.sqrt(np.mean(found.actuator**2 + load**2, axis=0))
-    return np.maximum(np.divide(left, size, where=size > 0.0, out=np.ones(len(left))), _SAME)
+    size = np.sqrt(np.mean(found.actuator**2, axis=0))
+    left = left / np.where(size > 0.0, size, 1.0)
+    return np.maximum(left, np.where(size > 0.0, _SAME, 1e-300))
 
 
 def _ranked(log: _Log, changes: Sequence[Change], now: _Residual) -> list[_Ranked]:
