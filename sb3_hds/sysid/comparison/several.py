@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from sb3_hds.effects import NAMELESS
 from sb3_hds.sysid.comparison.halves import Accepted, Base, Half, Tried
 from sb3_hds.sysid.comparison.held_out import Comparison, as_good, passes, t_or_rank_test
 from sb3_hds.sysid.comparison.search import Place, Search
@@ -15,7 +16,7 @@ from sb3_hds.sysid.equation.plausibility import rarity_of
 from sb3_hds.sysid.equation.regressors import LATE
 from sb3_hds.sysid.equation.screening import Screened
 from sb3_hds.sysid.equation.weak_form import FOLDS
-from sb3_hds.sysid.estimation.candidates import Candidate
+from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
 from sb3_hds.sysid.estimation.evidence import Point, in_threads
 from sb3_hds.sysid.estimation.shooting import evenly
 from sb3_hds.sysid.motion.joints import encoders
@@ -27,6 +28,8 @@ _LEAST = 0.01
 # Members beyond which a set counts as large: their sizes are those in the equation of motion, and
 # each of them, confirmed there on held-out data, only must not surely make predictions worse.
 _MANY = 6
+# Sets of so many causes may be the imitation of one.
+_FEW = 3
 # Steps of a fit of start states that begins where they were with one member more.
 _ROUGH_STEPS = 2
 # Windows of a large machine on which each member of its set is left out once.
@@ -73,6 +76,39 @@ def confirmed_set(
         if key in judged.verdicts
     ]
     return found, base
+
+
+def one_does_as_well(
+    search: Search, screened: Screened, found: Sequence[Accepted], start: Base, base: Base
+) -> bool:
+    """
+    :param found: a set of causes
+    :param start: the model without any cause
+    :param base: with the set
+    :return: whether a single cause without a column in the equation of motion, such as elasticity,
+        does as well as a small set, which may be its imitation; or whether a flexible force that
+        somebody asked for does better than any set
+    """
+    candidates, compare = search.hypotheses.candidates, search.ranking.compare
+    flexible = [c for c in candidates if c.name in {kind.name for kind in NAMELESS}]
+    if any(
+        t.point.cost < base.point.cost and not as_good(compare(t.held_out, base.held_out))
+        for t in search.fit(flexible, start)
+    ):
+        return True
+    there = {item.key for item in screened.problem.items}
+    most = sum(len(one.tried.candidate.parameters) for one in found)
+    others = [
+        c.key
+        for c in candidates
+        if c.key in there or c.slot == PARAMETER or len(c.parameters) > most
+    ]
+    if len(found) > _FEW or len(others) == len(candidates):
+        return False
+    return any(
+        t.point.cost < base.point.cost and as_good(compare(base.held_out, t.held_out))
+        for t in search.finalists(start, others)
+    )
 
 
 class _Judged(NamedTuple):
@@ -171,13 +207,20 @@ def _judge_many(search: Search, screened: Screened, start: Base, base: Base) -> 
 def _with_likelier(
     search: Search, screened: Screened, start: Base, base: Base
 ) -> tuple[Screened, Base]:
-    """:return: the set with what the equation hardly tells from a member, where it is preferred"""
+    """
+    Fit dry friction in place of each dead zone. Whether commands are late by a lag or a delay, the
+    equation has to say of a large set: to simulate both takes longer than all the rest.
+
+    :return: the set, with what is preferred
+    """
     for member in screened.members:
         members = _members(search, screened)
         others = screened.problem.hardly_told_from(member.item)
         if not others or member.key not in members:
             continue
         candidate, _ = members[member.key]
+        if candidate.name in LATE:
+            continue
         lost = search.without(base, candidate, near=base, rival=base)
         tried = _in_place_of(search, screened, start, base, member.key, lost, others)
         better = [t for t in tried if _preferred(search, t, candidate, base)]

@@ -8,16 +8,15 @@ import numpy as np
 
 from sb3_hds.core import AnalyticTwin, Effect, Trajectories, Twin
 from sb3_hds.core.twin import plant_of
-from sb3_hds.effects import NAMELESS as NAMELESS_EFFECTS
 from sb3_hds.sysid.belief.opened import nothing_known, open_answers
 from sb3_hds.sysid.checks.adequacy import distances, far_in_words
 from sb3_hds.sysid.checks.conventions import Convention
 from sb3_hds.sysid.checks.timing import stepping_by
 from sb3_hds.sysid.comparison.halves import Accepted, Base, Effort, Tried
-from sb3_hds.sysid.comparison.held_out import Comparison, as_good
+from sb3_hds.sysid.comparison.held_out import Comparison
 from sb3_hds.sysid.comparison.inference import detectable_sizes
 from sb3_hds.sysid.comparison.search import Search
-from sb3_hds.sysid.comparison.several import confirmed_set, proposed_set
+from sb3_hds.sysid.comparison.several import confirmed_set, one_does_as_well, proposed_set
 from sb3_hds.sysid.diagnosis.findings import (
     SMALL,
     bounds_in_words,
@@ -168,7 +167,7 @@ class Inquiry:
         naming = Naming(self.search, start, self.seed, family=self._family())
         if len(found) == 1:
             found, base = naming.beside(found, base)
-        if len(found) < 2 or self._worse_than_a_flexible_candidate(start, base):
+        if len(found) < 2 or one_does_as_well(self.search, screened, found, start, base):
             return None
         self.bar.stage("what is left")
         before, left = self.residuals.left(start), self.residuals.left(base)
@@ -186,16 +185,6 @@ class Inquiry:
             found, base, left, nearest = [], start, before, at_bounds
         self.rejected_for = naming.rejected_for | {key: SMALL for key in screened.hints}
         return self._result(found, beaten, start, base, before, left, nearest)
-
-    def _worse_than_a_flexible_candidate(self, start: Base, base: Base) -> bool:
-        """Whether a flexible force that somebody asked for does better than the set."""
-        names = {kind.name for kind in NAMELESS_EFFECTS}
-        asked = [c for c in self.hypotheses.candidates if c.name in names]
-        return any(
-            t.point.cost < base.point.cost
-            and not as_good(self.search.ranking.compare(t.held_out, base.held_out))
-            for t in self.search.fit(asked, start)
-        )
 
     def _each_alone(
         self, firsts: Sequence[Tried], start: Base
