@@ -6,7 +6,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from sb3_hds.core import Twin
 from sb3_hds.sysid.equation.regression import Equation
@@ -222,6 +221,8 @@ def late_commands(motion: Motion) -> Iterator[Change]:
 
 
 def _lagging(n: int, commands: np.ndarray) -> np.ndarray:
+    from scipy.signal import lfilter
+
     return np.asarray(lfilter([1.0 / (n + 1.0)], [1.0, -n / (n + 1.0)], commands, axis=0))
 
 
@@ -229,16 +230,14 @@ def _part(rows: slice, x: np.ndarray) -> np.ndarray:
     return x[rows]
 
 
-def turning_too_far(twin: Twin, motion: Motion) -> list[int]:
-    """:return: joints that move farther than the model's can"""
-    found = []
-    for j, joint in enumerate(twin.joints):
-        most = _BEYOND * (joint.high - joint.low)
-        if not np.isfinite(most):
-            most = _TURNS if joint.unit == "rad" else np.inf
-        if max(np.ptp(r.q[:, j]) for r in motion.recordings) > most:
-            found.append(j)
-    return found
+def beyond_limits(twin: Twin, motion: Motion) -> list[int]:
+    """:return: joints that move much farther than the limits of the model's allow"""
+    ranges = [_BEYOND * (joint.high - joint.low) for joint in twin.joints]
+    return [j for j, most in enumerate(ranges) if _reach(motion, j) > most]
+
+
+def _reach(motion: Motion, j: int) -> float:
+    return float(max(np.ptp(r.q[:, j]) for r in motion.recordings))
 
 
 def other_gears(
@@ -249,7 +248,12 @@ def other_gears(
     :return: positions on the motor's side of a gear, at each joint that moves too far, and at all
         of them with one ratio
     """
-    far = turning_too_far(twin, motion)
+    unlimited = [
+        j
+        for j, joint in enumerate(twin.joints)
+        if joint.unit == "rad" and not np.isfinite(joint.high - joint.low)
+    ]
+    far = beyond_limits(twin, motion) + [j for j in unlimited if _reach(motion, j) > _TURNS]
     for places in [[j] for j in far] + ([far] if len(far) > 1 else []):
         found = min((_geared(twin, places, ratio) for ratio in _RATIOS), key=residual)
         for step in _CLOSER:

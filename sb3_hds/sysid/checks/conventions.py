@@ -15,12 +15,12 @@ from sb3_hds.core.twin import plant_of
 from sb3_hds.effects import ConstantForce, CoulombFriction, ViscousFriction
 from sb3_hds.sysid.checks.changes import (
     Change,
+    beyond_limits,
     changes_of_columns,
     late_commands,
     other_gears,
     other_mountings,
     other_units_of_torques,
-    turning_too_far,
 )
 from sb3_hds.sysid.equation.assembly import assemble, normal_problem, rows_of
 from sb3_hds.sysid.equation.regression import Equation, squares
@@ -204,9 +204,9 @@ def _likeliest(log: _Log, now: _Residual) -> list[_Ranked]:
         *([units] if units else []),
         *other_gears(twin, few.motion, left),
     ]
-    if far := turning_too_far(twin, log.motion):
-        # Where a joint turns too far, nothing else is the reason for the residual.
-        nearer = [c for c in changes if len(turning_too_far(twin, c.motion(log.motion))) < len(far)]
+    if far := beyond_limits(twin, log.motion):
+        # Where a joint is beyond its limits, nothing else is the reason for the residual.
+        nearer = [c for c in changes if len(beyond_limits(twin, c.motion(log.motion))) < len(far)]
         changes = nearer or changes
     if len(changes) > _MANY and not log.known.nuisances:
         changes = sorted(changes, key=left)[:_MANY]

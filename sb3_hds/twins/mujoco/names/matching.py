@@ -184,7 +184,11 @@ def _nearest(signals: Sequence[Signal], unused: Mapping[str, Parsed]) -> list[tu
     for signal in signals:
         words = Parsed.of(signal.joint).joint
         core = words[len(own.before) : len(words) - len(own.after)]
-        fitting = [name for name, x in unused.items() if x.kinds in signal.kinds or not x.told]
+        fitting = [
+            name
+            for name, x in unused.items()
+            if x.kinds in signal.kinds or not (x.told or all(map(str.isdigit, x.joint)))
+        ]
         scores = {name: likeness(core, unused[name].joint) for name in fitting}
         best = max(scores.values(), default=0.0)
         near = [name for name in fitting if scores[name] == best >= _NEAR]
