@@ -42,7 +42,7 @@ _CONCERNED = 1.1
 # Changes that look like commands that are late by half a period.
 _REVERSING = ("direction", "command")
 # Shares of a force that count as nothing.
-_SAME = 1e-3
+_SAME = 1e-6
 # At most so many changes are listed that would do as well, to within _WORTH.
 _AS_GOOD = 2
 # Residuals below this multiple of the noise need no other convention.
@@ -193,9 +193,14 @@ def _likeliest(log: _Log, now: _Residual) -> list[_Ranked]:
     """:return: changes that lower the residual, the largest gain first"""
     twin, few = log.twin, log.fewer()
 
+    _, commanded = _left(twin, few.motion)
+
     def left(change: Change) -> float:
         changed = twin.with_parameters(**change.values)
-        return float(np.log(_left(changed, change.motion(few.motion))).sum())
+        rms, force = _left(changed, change.motion(few.motion))
+        share = rms / (force if change.name == "torque" else commanded)
+        total = float(np.log(np.maximum(share, _SAME)).sum())
+        return total if np.isfinite(total) else np.inf
 
     units = other_units_of_torques(twin, now.equation)
     changes = [
@@ -215,10 +220,11 @@ def _likeliest(log: _Log, now: _Residual) -> list[_Ranked]:
     return _ranked(log, changes, now)
 
 
-def _left(twin: Twin, motion: Motion) -> np.ndarray:
+def _left(twin: Twin, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """
-    :return: what friction and an offset leave of each joint's equation of motion, by ordinary least
-        squares on all rows, in units of the actuator's force [1]; without one, [N m] or [N]
+    :return: root mean square of what friction and an offset leave of each joint's equation of
+        motion, by ordinary least squares on all rows, and of the actuator's force, or one without
+        an actuator
     """
     rows = rows_of(motion)
     found = terms(twin, twin.params, rows.q, rows.v, rows.actions)
@@ -228,8 +234,7 @@ def _left(twin: Twin, motion: Motion) -> np.ndarray:
         friction = np.stack([v, np.sign(v), np.ones_like(v)], 1)
         left.append(np.std(force - friction @ np.linalg.lstsq(friction, force, rcond=None)[0]))
     size = np.sqrt(np.mean(found.actuator**2, axis=0))
-    left = left / np.where(size > 0.0, size, 1.0)
-    return np.maximum(left, np.where(size > 0.0, _SAME, 1e-300))
+    return np.array(left), np.where(size > 0.0, size, 1.0)
 
 
 def _ranked(log: _Log, changes: Sequence[Change], now: _Residual) -> list[_Ranked]:
