@@ -14,9 +14,9 @@ from sb3_hds.sysid.equation.held_out_folds import simpler_items
 from sb3_hds.sysid.equation.members import Member
 from sb3_hds.sysid.equation.plausibility import rarity_of
 from sb3_hds.sysid.equation.regressors import LATE
-from sb3_hds.sysid.equation.screening import Screened
+from sb3_hds.sysid.equation.screening import FEW, LIKELIEST, Screened
 from sb3_hds.sysid.equation.weak_form import FOLDS
-from sb3_hds.sysid.estimation.candidates import PARAMETER, Candidate
+from sb3_hds.sysid.estimation.candidates import Candidate
 from sb3_hds.sysid.estimation.evidence import Point, in_threads
 from sb3_hds.sysid.estimation.shooting import evenly
 from sb3_hds.sysid.motion.joints import encoders
@@ -28,8 +28,6 @@ _LEAST = 0.01
 # Members beyond which a set counts as large: their sizes are those in the equation of motion, and
 # each of them, confirmed there on held-out data, only must not surely make predictions worse.
 _MANY = 6
-# Sets of so many causes may be the imitation of one.
-_FEW = 3
 # Steps of a fit of start states that begins where they were with one member more.
 _ROUGH_STEPS = 2
 # Windows of a large machine on which each member of its set is left out once.
@@ -85,9 +83,9 @@ def one_does_as_well(
     :param found: a set of causes
     :param start: the model without any cause
     :param base: with the set
-    :return: whether a single cause without a column in the equation of motion, such as elasticity,
-        does as well as a small set, which may be its imitation; or whether a flexible force that
-        somebody asked for does better than any set
+    :return: whether a single cause, of those without a column in the equation of motion, such as
+        elasticity, or the likeliest by it, does as well as a small set, which may be its imitation;
+        or whether a flexible force that somebody asked for does better than any set
     """
     candidates, compare = search.hypotheses.candidates, search.ranking.compare
     flexible = [c for c in candidates if c.name in {kind.name for kind in NAMELESS}]
@@ -96,14 +94,14 @@ def one_does_as_well(
         for t in search.fit(flexible, start)
     ):
         return True
-    there = {item.key for item in screened.problem.items}
+    if len(found) > FEW:
+        return False
+    p, own = screened.problem, {one.tried.candidate.key for one in found}
+    likely = list(dict.fromkeys(p.items[i].key for i in p.ranking(p.always)))[:LIKELIEST]
+    unlikely = {item.key for item in p.items} - {*likely} | own
     most = sum(len(one.tried.candidate.parameters) for one in found)
-    others = [
-        c.key
-        for c in candidates
-        if c.key in there or c.slot == PARAMETER or len(c.parameters) > most
-    ]
-    if len(found) > _FEW or len(others) == len(candidates):
+    others = [c.key for c in candidates if c.key in unlikely or len(c.parameters) > most]
+    if len(others) == len(candidates):
         return False
     return any(
         t.point.cost < base.point.cost and as_good(compare(base.held_out, t.held_out))

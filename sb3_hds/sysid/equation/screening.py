@@ -28,6 +28,8 @@ from sb3_hds.sysid.motion.motion import Motion
 # Single candidates that are simulated besides the set and its equivalents: in all, and for each
 # joint.
 _SINGLES, _OF_A_JOINT = 10, 5
+#: single candidates that are simulated beside a small set of causes, and the causes of one
+LIKELIEST, FEW = 3, 3
 # Detection limit: share of the nominal model's residual that a cause explains, and by how much it
 # exceeds its price, in -2 log likelihood: the least gain and the least information gain by which
 # simulations confirm a cause.
@@ -230,6 +232,8 @@ def screen(
     keys = {m.key for m in set_of}
     keys |= {p.items[o].key for m in set_of for o in simpler_items(p, m.item)}
     keys |= {key for m in set_of for key in p.hardly_told_from(m.item)}
+    if len(set_of) <= FEW:
+        keys |= {*list(dict.fromkeys(p.items[i].key for i in p.ranking(p.always)))[:LIKELIEST]}
     if small or len(set_of) < 2:
         keys |= {*(k for m in set_of for k in m.others), *_singles(p), *hints}
         keys |= _without_column(hypotheses, p, moved, where)
