@@ -145,6 +145,18 @@ def test_dry_friction_is_fitted_in_the_place_of_a_dead_zone(largest, monkeypatch
     assert {f.key for f in found.findings} == {VISCOUS, DRY}
 
 
+@pytest.mark.expensive
+@each(
+    # One cause that a delay and a scale imitate, and two that are one of two parameters.
+    ("linear_axis", 16, "joint_elasticity.axis", ""),
+    ("cart_pole", 7, "coulomb_friction.track", "constant_force.track"),
+)
+def test_a_small_set_is_compared_with_single_causes(system, number, named, more):
+    found = hidden_effects.run(system, number, "quick", rules=False)
+
+    assert (found["named"], found["more"]) == (named, more)
+
+
 def test_what_is_there_shows_and_what_is_not_does_not(screened):
     shown = visible(screened, [VISCOUS, DRY, "quadratic_drag.axis", "backlash.axis"])
 

@@ -100,7 +100,12 @@ def one_does_as_well(
     likely = list(dict.fromkeys(p.items[i].key for i in p.ranking(p.always)))[:LIKELIEST]
     unlikely = {item.key for item in p.items} - {*likely} | own
     most = sum(len(one.tried.candidate.parameters) for one in found)
-    others = [c.key for c in candidates if c.key in unlikely or len(c.parameters) > most]
+    # With as many parameters, the equation has preferred the set.
+    others = [
+        c.key
+        for c in candidates
+        if c.key in unlikely or len(c.parameters) > most - (c.key in likely)
+    ]
     if len(others) == len(candidates):
         return False
     return any(
